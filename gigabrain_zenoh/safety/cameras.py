@@ -1,7 +1,8 @@
-"""Monitor of the cameras with depth: whether each is to be believed, and what they have seen.
+"""Monitor of the depth cameras: the faults of each, and the obstacles that they see.
 
-Obstacles are remembered in the frame of the odometry until a picture shows that they are gone, or
-they are out of reach: a camera looks ahead, and the body drives over what it saw, or backs into it.
+A camera looks ahead, so it loses sight of obstacles close to the body and behind it. They are
+remembered in the odometry's frame until a picture shows that they are gone, or they are out of
+reach.
 """
 
 import math
@@ -33,29 +34,29 @@ from gigabrain_zenoh.safety.depth import (
     view_of,
 )
 
-LATE_PERIODS = 2.5  # of a camera without a picture, unless the allowed age of scans is longer
-AGAIN_TICKS = 50  # 1 s without a late picture, after which a camera that was late counts again
-MIN_PERIOD_SHARE = 0.5  # of its period: pictures that come faster are skipped
-FROZEN_M, FROZEN_RAD = 0.02, math.radians(2)  # moved while the picture stays exactly the same
-UP_STEP = 0.01  # of the vertical's x and y: 0.6 deg, to which a tilt counts
-WAYS = {"forward": 0.0, "left": math.pi / 2, "backward": math.pi, "right": -math.pi / 2}
-MIN_SIDE = math.radians(45)  # from its axis, to which a camera must see at least
-CELL_M = 0.03  # of points nearer than this one is kept
-NEAR_M = 0.04  # within which two sightings of a doubtful point confirm each other
-PENDING, BELIEVED = 1, 3  # levels; from 2 on a point counts, and each look through it takes one
-PENDING_PERIODS = 2.5  # after which a doubtful point that was not seen again is dropped
-DRIFT_M = 0.02  # inside the footprint: what stands there can be no thing
-JUMP_M = 0.5  # between two pictures, farther than it can drive: the odometry has restarted
+LATE_PERIODS = 2.5  # a picture after this many is late, unless the age limit of scans is longer
+RECOVERY_TICKS = 50  # 1 s without a late picture, before a late camera is trusted again
+MIN_PERIOD_SHARE = 0.5  # of the camera's period; pictures that come faster are skipped
+FROZEN_M, FROZEN_RAD = 0.02, math.radians(2)  # motion that must change the picture
+UP_STEP = 0.01  # resolution of the vertical's x and y: 0.6 deg
+DIRECTION_YAWS = {"forward": 0.0, "left": math.pi / 2, "backward": math.pi, "right": -math.pi / 2}
+MIN_HALF_ANGLE = math.radians(45)  # also of a narrower camera, for the directions it must see
+CELL_M = 0.03  # side of a cell, which keeps one point
+CONFIRM_M = 0.04  # two sightings of a doubtful point this near confirm each other
+PENDING, BELIEVED = 1, 3  # levels: a point counts from 2 on; each look through it subtracts 1
+PENDING_PERIODS = 2.5  # a doubtful point is dropped after this many, unless seen again
+DRIFT_M = 0.02  # points farther inside the footprint are no obstacles
+JUMP_M = 0.5  # farther than the body can drive between two pictures: the odometry has restarted
 MAX_POINTS = 1500
-MIN_KNOWN = 0.8  # share of the pixels whose rays follow from the intrinsics
-CHECK_TICKS = 5  # without pictures, between two looks at what is remembered
+MIN_KNOWN = 0.8  # share of the pixels with a known ray
+CHECK_TICKS = 5  # between two checks of remembered points without pictures
 
 
 class Picture(Struct, frozen=True, kw_only=True):
     """The newest picture of a camera, and its age."""
 
     image: DepthImage
-    age_ns: int = 0  # by arrival
+    age_ns: int = 0  # since its arrival
 
 
 Pictures = Mapping[str, Picture]
@@ -63,15 +64,15 @@ NO_PICTURES: Pictures = {}
 
 
 class Marks(NamedTuple):
-    """Remembered points, in the frame of the odometry."""
+    """Remembered points in the odometry's frame."""
 
     points: Floats  # (n, 3) [m]
     hole: Mask  # (n,)
-    level: NDArray[np.int8]  # (n,)
+    level: NDArray[np.int8]  # (n,), from PENDING to BELIEVED
     tick: NDArray[np.int64]  # (n,), of the last sighting
 
-    def where(self, keep: Mask) -> "Marks":
-        """Return the marks that `keep` (n,) names."""
+    def select(self, keep: Mask) -> "Marks":
+        """Return the marks in the mask `keep` (n,)."""
         if keep.all():
             return self
         return Marks(self.points[keep], self.hole[keep], self.level[keep], self.tick[keep])
@@ -84,36 +85,36 @@ class CameraState(Struct, frozen=True, kw_only=True):
     """The state of one camera and of its newest picture."""
 
     basis: int = 0  # tick of the newest picture; 0 before the first
-    code: str = ""  # of the cause for which that one cannot be believed
+    code: str = ""  # of that picture's fault; empty without one
     text: str = ""
-    plane: bytes = b""  # of that picture, as it came
-    since: Pose | None = None  # where the body was when that plane first came
-    late: int = 0  # tick at which a picture was last overdue; 0 for never
+    plane: bytes = b""  # of that picture, encoded
+    since: Pose | None = None  # of the body when the same plane first came
+    late: int = 0  # last tick with an overdue picture; 0 for never
 
 
 class Cameras(Struct, frozen=True, kw_only=True):
-    """All cameras with depth of a body, and what they have seen."""
+    """All depth cameras of a body, and the obstacles that they saw."""
 
     states: Mapping[str, CameraState] = {}
     marks: Marks = NO_MARKS
     pose: Pose | None = None  # at the newest picture
     basis: int = 0  # tick of that picture
-    checked: int = 0  # tick at which `obstacles` were last wanted
-    pictures: int = 0  # that were looked at
+    checked: int = 0  # tick of the last check of remembered points
+    pictures: int = 0  # processed so far
     causes: tuple[Cause, ...] = ()
-    blind: frozenset[str] = frozenset()  # directions that a camera should see, and does not
+    blind: frozenset[str] = frozenset()  # directions that a camera should see, but does not
 
     def then(
         self, body: BodyDescription, pictures: Pictures, state: RobotState, history: PoseHistory
     ) -> "Cameras":
-        """Return the monitor after one more state, or picture."""
+        """Return the monitor after one more state or picture."""
         now = self
         for camera in depth_cameras(body):
             picture = pictures.get(camera.name)
             if picture and now._due(camera, picture.image, state):
                 pose = history.at(state.boot, picture.image.basis)
-                now = now._with(body, camera, picture.image, state, pose) if pose else now
-        causes, dark = [], set[str]()
+                now = now._with_picture(body, camera, picture.image, state, pose) if pose else now
+        causes, unseen = [], set[str]()
         for camera in depth_cameras(body):
             seen = now.states.get(camera.name)
             if seen and _overdue(body, camera, seen, pictures.get(camera.name), state):
@@ -121,30 +122,30 @@ class Cameras(Struct, frozen=True, kw_only=True):
                 now = replace(now, states={**now.states, camera.name: seen})
             if found := now._cause(body, camera, pictures.get(camera.name), state):
                 causes.append(found)
-                dark |= directions(camera)
-        now = replace(now, causes=tuple(causes), blind=frozenset(dark))
+                unseen |= directions(camera)
+        now = replace(now, causes=tuple(causes), blind=frozenset(unseen))
         if now.pictures != self.pictures or state.tick - self.checked >= CHECK_TICKS:
-            now = replace(now, checked=state.tick, marks=_kept(body, now.marks, state))
+            now = replace(now, checked=state.tick, marks=_in_reach(body, now.marks, state))
         return now
 
     @property
-    def seen(self) -> tuple[int, int]:
-        """Changes where the obstacles have to be looked at again."""
+    def version(self) -> tuple[int, int]:
+        """Value that changes whenever `obstacles` may change."""
         return self.pictures, self.checked
 
     def obstacles(self, pose: Pose) -> Floats:
-        """Return what stands or gapes around a body at `pose`, (n, 2) [m] in its frame."""
+        """Return obstacles and holes around a body at `pose`, (n, 2) [m] in its frame."""
         points = self.marks.points[self.marks.level > PENDING, :2]
         return transform(from_pose(relative(pose, Pose(x=0.0, y=0.0, yaw=0.0))), points)
 
     def _due(self, camera: Camera, image: DepthImage, state: RobotState) -> bool:
-        """Return whether a picture is new, of the past, and not of a flood."""
+        """Return whether a picture is new, not of the future, and not too soon."""
         before = self.states.get(camera.name, CameraState()).basis
         period = 1e9 / camera.rate_hz / TICK_NS
-        least = MIN_PERIOD_SHARE * period if before else 1
-        return before + least <= image.basis <= state.tick
+        min_ticks = MIN_PERIOD_SHARE * period if before else 1
+        return before + min_ticks <= image.basis <= state.tick
 
-    def _with(
+    def _with_picture(
         self,
         body: BodyDescription,
         camera: Camera,
@@ -152,27 +153,27 @@ class Cameras(Struct, frozen=True, kw_only=True):
         state: RobotState,
         pose: Pose,
     ) -> "Cameras":
-        """Look at one picture, which was taken where the body was at `pose`."""
+        """Process a picture that was taken with the body at `pose`."""
         before = self.states.get(camera.name, CameraState())
         same = image.planes[0] == before.plane
         since = before.since if same and before.since else pose
         marks, code, text = self.marks, "", ""
         fastest = math.hypot(body.max_linear_speed, body.max_lateral_speed)
-        most = JUMP_M + fastest * abs(image.basis - self.basis) * TICK_S
-        if self.pose and math.hypot(pose.x - self.pose.x, pose.y - self.pose.y) > most:
+        max_m = JUMP_M + fastest * abs(image.basis - self.basis) * TICK_S
+        if self.pose and math.hypot(pose.x - self.pose.x, pose.y - self.pose.y) > max_m:
             marks = NO_MARKS
-        wanted = (camera.width, camera.height)
+        size = (camera.width, camera.height)
         if image.frame_id != camera.name:
             code, text = "camera_wrong", f"sends pictures of the camera {image.frame_id!r}"
-        elif (image.width, image.height) != wanted:
+        elif (image.width, image.height) != size:
             code = "camera_wrong"
-            text = f"has {image.width} x {image.height} pixels, its file {wanted[0]} x {wanted[1]}"
+            text = f"has {image.width} x {image.height} pixels, its file {size[0]} x {size[1]}"
         else:
-            looked = _look(body, camera, image, (pose, _up(state)), marks)
-            if same and not looked[1] and _moved(since, pose):  # two dark pictures may be the same
+            result = _look(body, camera, image, (pose, _up(state)), marks)
+            if same and not result[1] and _moved(since, pose):  # dark pictures may be equal
                 code, text = "camera_frozen", "repeats one picture while the body moves"
             else:
-                marks, code, text = looked
+                marks, code, text = result
         seen = replace(
             before, basis=image.basis, code=code, text=text, plane=image.planes[0], since=since
         )
@@ -185,13 +186,13 @@ class Cameras(Struct, frozen=True, kw_only=True):
     def _cause(
         self, body: BodyDescription, camera: Camera, picture: Picture | None, state: RobotState
     ) -> Cause | None:
-        """Return why a camera cannot be believed now."""
+        """Return the present fault of a camera."""
         seen = self.states.get(camera.name)
         if seen is None or picture is None:
             return cause("camera_lost", f"no picture of camera {camera.name} has come yet")
         if late := _overdue(body, camera, seen, picture, state):
             return cause("camera_lost", late)
-        if seen.late and state.tick - seen.late < AGAIN_TICKS:
+        if seen.late and state.tick - seen.late < RECOVERY_TICKS:
             return cause("camera_lost", f"pictures of camera {camera.name} have just come again")
         return cause(seen.code, f"camera {camera.name} {seen.text}") if seen.code else None
 
@@ -208,7 +209,7 @@ def _overdue(
     picture: Picture | None,
     state: RobotState,
 ) -> str:
-    """Return that the newest picture is too old; empty if it is not."""
+    """Return a text if the newest picture is too old; empty otherwise."""
     limit_ns = max(body.thresholds.scan_age * 1e9, LATE_PERIODS * 1e9 / camera.rate_hz)
     age_ns = (state.tick - seen.basis) * TICK_NS
     if max(age_ns, picture.age_ns if picture else 0) <= limit_ns:
@@ -221,14 +222,16 @@ def _overdue(
 def directions(camera: Camera) -> set[str]:
     """Return the directions of motion that a camera should see."""
     fx, *_ = camera.pinhole
-    side = max(math.atan2(camera.width / 2, fx), MIN_SIDE) + 1e-6
+    side = max(math.atan2(camera.width / 2, fx), MIN_HALF_ANGLE) + 1e-6
     return {
-        way for way, yaw in WAYS.items() if abs(math.remainder(yaw - camera.yaw, math.tau)) <= side
+        way
+        for way, yaw in DIRECTION_YAWS.items()
+        if abs(math.remainder(yaw - camera.yaw, math.tau)) <= side
     }
 
 
 def _up(state: RobotState) -> Up:
-    """Return x and y of the vertical in the body's frame, in steps; (0, 0) for a level body."""
+    """Return x and y of the vertical in the body's frame, rounded; (0, 0) for a level body."""
     if state.imu is None:
         return 0.0, 0.0
     x, y, z, w = state.imu.orientation
@@ -238,14 +241,17 @@ def _up(state: RobotState) -> Up:
 
 
 def _moved(since: Pose, pose: Pose) -> bool:
-    way = math.hypot(pose.x - since.x, pose.y - since.y)
-    return way > FROZEN_M or abs(math.remainder(pose.yaw - since.yaw, math.tau)) > FROZEN_RAD
+    distance = math.hypot(pose.x - since.x, pose.y - since.y)
+    return distance > FROZEN_M or abs(math.remainder(pose.yaw - since.yaw, math.tau)) > FROZEN_RAD
 
 
 def _look(
     body: BodyDescription, camera: Camera, image: DepthImage, place: tuple[Pose, Up], marks: Marks
 ) -> tuple[Marks, str, str]:
-    """Return the marks after a picture from a `place`, and the code and text of its fault."""
+    """Return the marks after a picture, and the code and text of its fault.
+
+    `place` has the body's pose and vertical.
+    """
     try:
         picture = image.quarter()
     except ValueError as error:
@@ -255,41 +261,41 @@ def _look(
     if view.known < MIN_KNOWN:
         return marks, "camera_wrong", "has a distortion in its file that no lens has"
     dark = blind(camera, view, picture)
-    wanted = view._replace(sure=np.zeros_like(view.sure)) if dark else view
-    found = sight(body, camera, wanted, picture)
+    trusted = view._replace(sure=np.zeros_like(view.sure)) if dark else view
+    found = sight(body, camera, trusted, picture)
     if len(marks.level):
         here = _in_frame(pose, marks.points)
         gone = seen_through(camera, view, picture, here, marks.hole)
         marks = marks._replace(level=(marks.level - gone).astype(np.int8))
-        marks = marks.where(marks.level > 0)
+        marks = marks.select(marks.level > 0)
     oldest = image.basis - PENDING_PERIODS * 1e9 / camera.rate_hz / TICK_NS
-    marks = _merged(marks, found, pose, image.basis)
-    marks = marks.where((marks.level > PENDING) | (marks.tick >= oldest))
+    marks = _merge(marks, found, pose, image.basis)
+    marks = marks.select((marks.level > PENDING) | (marks.tick >= oldest))
     if dark:
         return marks, "camera_blind", "sees neither the floor nor anything before it"
     return marks, "", ""
 
 
 def _in_frame(pose: Pose, points: Floats) -> Floats:
-    """Return `points` (n, 3) of the odometry's frame in that of a body at `pose`."""
+    """Transform `points` (n, 3) from the odometry's frame to that of a body at `pose`."""
     origin = from_pose(relative(pose, Pose(x=0.0, y=0.0, yaw=0.0)))
     return np.column_stack((transform(origin, points[:, :2]), points[:, 2]))
 
 
-def _merged(marks: Marks, found: Sighting, pose: Pose, tick: int) -> Marks:
-    """Return `marks` with what was found from `pose`; what is doubtful waits for a second look."""
+def _merge(marks: Marks, found: Sighting, pose: Pose, tick: int) -> Marks:
+    """Add points `found` from `pose`; doubtful ones wait for a second sighting."""
     if not len(found.points):
         return marks
     points = np.column_stack((transform(from_pose(pose), found.points[:, :2]), found.points[:, 2]))
     sure = found.sure.copy()
-    doubt = np.flatnonzero(~sure)
-    if len(doubt) and len(marks.points):
-        off = points[doubt, None, :2] - marks.points[None, :, :2]
-        near = (off**2).sum(axis=-1) <= NEAR_M**2
-        near &= found.hole[doubt, None] == marks.hole
-        sure[doubt] = near.any(axis=1)
+    doubtful = np.flatnonzero(~sure)
+    if len(doubtful) and len(marks.points):
+        offsets = points[doubtful, None, :2] - marks.points[None, :, :2]
+        near = (offsets**2).sum(axis=-1) <= CONFIRM_M**2
+        near &= found.hole[doubtful, None] == marks.hole
+        sure[doubtful] = near.any(axis=1)
     level = np.where(sure, BELIEVED, PENDING).astype(np.int8)
-    order = np.argsort(~sure, kind="stable")  # of two in a cell the sure one is kept
+    order = np.argsort(~sure, kind="stable")  # so that a cell keeps its sure point
     all_marks = Marks(
         np.concatenate((points[order], marks.points)),
         np.concatenate((found.hole[order], marks.hole)),
@@ -304,17 +310,17 @@ def _merged(marks: Marks, found: Sighting, pose: Pose, tick: int) -> Marks:
     _, first = np.unique(keys[ranked], return_index=True)
     keep = np.zeros(len(keys), bool)
     keep[ranked[first]] = True
-    return all_marks.where(keep)
+    return all_marks.select(keep)
 
 
-def _kept(body: BodyDescription, marks: Marks, state: RobotState) -> Marks:
-    """Return the marks in reach; no thing is where the body stands, but it may be over a hole."""
+def _in_reach(body: BodyDescription, marks: Marks, state: RobotState) -> Marks:
+    """Return the marks in reach, without obstacles under the body; a hole may be there."""
     if not len(marks.level):
         return marks
-    here = _in_frame(state.pose, marks.points)[:, :2]
-    away = np.hypot(here[:, 0], here[:, 1])
-    keep = away <= reach_of(body)
-    keep &= marks.hole | (outside(edges(body.footprint), here) > -DRIFT_M)
+    points = _in_frame(state.pose, marks.points)[:, :2]
+    distances = np.hypot(points[:, 0], points[:, 1])
+    keep = distances <= reach_of(body)
+    keep &= marks.hole | (outside(edges(body.footprint), points) > -DRIFT_M)
     if np.count_nonzero(keep) > MAX_POINTS:
-        keep &= away <= np.partition(away[keep], MAX_POINTS)[MAX_POINTS]
-    return marks.where(keep)
+        keep &= distances <= np.partition(distances[keep], MAX_POINTS)[MAX_POINTS]
+    return marks.select(keep)

@@ -1,4 +1,4 @@
-"""Causes and warnings that safety can find, and for how long a fault must last to count."""
+"""Causes and warnings that safety reports, and how to count the ticks of a fault."""
 
 import math
 
@@ -6,7 +6,7 @@ from msgspec.structs import replace
 
 from gigabrain_schemas.base import TICK_NS, Cause
 
-MAX_STEP_TICKS = 5  # a sample after a longer gap counts for no more than this
+MAX_STEP_TICKS = 5  # that one state can count for, after any gap
 
 
 def _causes(*rows: tuple[str, str, str], latching: bool = False) -> dict[str, Cause]:
@@ -159,16 +159,16 @@ WARNINGS = _causes(
 
 
 def cause(code: str, text: str = "") -> Cause:
-    """Return the cause or warning `code`; `text`, for example with figures, replaces its own."""
+    """Return the cause or warning `code`; a `text` replaces its own, for example with figures."""
     known = CAUSES.get(code) or WARNINGS[code]
     return replace(known, text=text) if text else known
 
 
 def ticks_of(seconds: float) -> int:
-    """Return the whole ticks that last at least `seconds`."""
+    """Return `seconds` in ticks, rounded up."""
     return math.ceil(seconds * 1e9 / TICK_NS - 1e-9)
 
 
 def lasting(ticks: int, wrong: bool, elapsed: int) -> int:
-    """Return the count of ticks for which a fault has lasted without a break."""
+    """Return the ticks of a fault after `elapsed` more; 0 unless it is still `wrong`."""
     return ticks + elapsed if wrong else 0

@@ -1,8 +1,8 @@
-"""Obstacles in one depth picture: what stands above the floor, and where the floor is missing.
+"""Obstacles in one depth picture: objects on the floor, and holes in it.
 
-Safety's own code, by numpy alone, on the picture at half its width and height. All that it decides
-about a pixel is a depth that was computed once for the camera's place: nearer than `above` the
-pixel shows something that stands on the floor, beyond `below` it looks through a hole in it.
+This is safety's own code, by numpy only, on the picture at half its width and height. Each pixel is
+compared with depths that are computed once for the camera's mounting. Nearer than `above` it shows
+an object on the floor; beyond `below` it shows a hole.
 """
 
 import math
@@ -18,21 +18,21 @@ from gigabrain_zenoh.geometry.stopping import brakes
 from gigabrain_zenoh.geometry.sweep import depth as outside
 from gigabrain_zenoh.geometry.sweep import edges, radius
 
-MOUNT_M, MOUNT_RAD = 0.005, math.radians(0.5)  # to which the mounting of a camera is known
-NOISE_PER_M2, SIGMAS = 0.0015, 3.0  # [1/m], the deviation of a depth z is this times z^2
-MEMORY_M = 0.3  # beyond the stopping distance, what is seen is remembered
-UNDISTORT_STEPS, UNDISTORTED = 20, 1e-3  # and how far off a ray may be then, 1 m ahead
-MIN_DIVISOR = 1e-3  # of the rational model of a lens; that of a real one is larger
-WIDEST = 20.0  # [m] aside of what is 1 m ahead: no lens sees that
+MOUNT_M, MOUNT_RAD = 0.005, math.radians(0.5)  # accuracy of a camera's mounting
+NOISE_PER_M2, SIGMAS = 0.0015, 3.0  # [1/m], times z^2: standard deviation of a depth z
+MEMORY_M = 0.3  # obstacles are remembered this far beyond the stopping distance
+UNDISTORT_STEPS, MAX_UNDISTORT_ERROR = 20, 1e-3  # iterations; [m] at 1 m ahead
+MIN_DIVISOR = 1e-3  # of a lens's rational model; real lenses have larger ones
+MAX_ASIDE_M = 20.0  # at 1 m ahead; no lens sees more
 NEVER = 65535  # [mm], a depth that no pixel has
-KEPT_VIEWS = 8  # of all cameras and tilts
-# beyond depth_min, of depth_max: the floor must be seen there
+MAX_CACHED_VIEWS = 8  # of all cameras and tilts
+# the floor must be visible from depth_min + JUDGED_NEAR_M to JUDGED_SHARE * depth_max
 JUDGED_NEAR_M, JUDGED_SHARE = 0.05, 0.8
-ALIKE_M, ALIKE_SHARE = 0.015, 0.02  # by which depths on one surface differ from pixel to pixel
-BESIDE, CERTAIN_BESIDE = 2, 4  # of 8 neighbours alike: to be believed if confirmed, at once
-HOLE_BESIDE, CERTAIN_HOLE_BESIDE = 3, 6  # the same of holes
-BLIND_FLOOR, BLIND = 0.8, 0.95  # share of unknown pixels
-GAP_PX = 5  # side of a square without any floor that is no flaw of the picture
+ALIKE_M, ALIKE_SHARE = 0.015, 0.02  # maximum difference of neighbouring depths on one surface
+MIN_NEIGHBOURS, SURE_NEIGHBOURS = 2, 4  # alike, of 8, of a doubtful and a sure point
+MIN_HOLE_NEIGHBOURS, SURE_HOLE_NEIGHBOURS = 3, 6  # the same for holes
+MAX_UNKNOWN_FLOOR, MAX_UNKNOWN = 0.8, 0.95  # shares of pixels; with more the camera is blind
+GAP_PX = 5  # a square of this side without any floor is no flaw of the picture
 
 Pixels = NDArray[np.uint16]
 Mask = NDArray[np.bool_]
@@ -43,53 +43,53 @@ class View(NamedTuple):
     """A camera on a body; arrays are (height / 2, width / 2), by pixel."""
 
     mount: Floats  # (3,) [m], in the body's frame, z from the floor
-    rays: NDArray[np.float32]  # (h, w, 3), from there for each metre of depth
-    flat: NDArray[np.float32]  # (h, w), length of `rays` in the plane
-    above: Pixels  # [mm], any depth below this one shows something that stands on the floor
-    own: Pixels  # [mm], up to here it is the body itself
-    within: Pixels  # [mm], up to here that is an obstacle: in reach, and not over the body
-    below: Pixels  # [mm], a depth beyond this one shows a hole; NEVER beyond reach
+    rays: NDArray[np.float32]  # (h, w, 3), from `mount`, for 1 m of depth
+    flat: NDArray[np.float32]  # (h, w), horizontal length of `rays`
+    above: Pixels  # [mm], a smaller depth shows an object on the floor
+    own: Pixels  # [mm], a depth up to here shows the body itself
+    within: Pixels  # [mm], an object up to here is in reach, and not above the body's top
+    below: Pixels  # [mm], a larger depth shows a hole; NEVER beyond reach
     floor: NDArray[np.float32]  # (h, w) [m], depth at which the ray meets the floor
-    sure: Mask  # the floor is so near that it must be seen, or what stands on it
+    sure: Mask  # the floor, or an object on it, must be visible
     upright: bool  # columns of the picture are vertical
-    known: float  # share of the pixels whose ray is known
+    known: float  # share of the pixels with a known ray
 
 
 class Sighting(NamedTuple):
     """Points of obstacles in one picture, in the body's frame."""
 
-    points: Floats  # (n, 3) [m]; of a hole its edge on the floor
+    points: Floats  # (n, 3) [m]; for a hole, its edge on the floor
     hole: Mask  # (n,)
-    sure: Mask  # (n,), enough of it is seen to believe it at once
+    sure: Mask  # (n,), large enough to count at once
 
 
 def reach_of(body: BodyDescription) -> float:
-    """Return how far from the body's middle obstacles are remembered [m]."""
+    """Return the distance from the body's middle up to which obstacles are remembered [m]."""
     return brakes(body)["forward"].reach + radius(body.footprint) + MEMORY_M
 
 
 class _Level(NamedTuple):
-    """A camera on a level body, and what its views from a tilted one are computed from."""
+    """The view of a camera on a level body, and the data for views of a tilted one."""
 
     view: View
     rays: Floats  # (h, w, 3), as in `view`, exact
-    angle: Floats  # (h, w), error of heights for each metre of depth
+    angle: Floats  # (h, w), height error per metre of depth
     known: Mask  # (h, w)
 
 
-@lru_cache(maxsize=KEPT_VIEWS)
+@lru_cache(maxsize=MAX_CACHED_VIEWS)
 def view_of(body: BodyDescription, camera: Camera, up: Up = (0.0, 0.0)) -> View:
-    """Return the view of a camera on a body, whose vertical is `up` in its own frame.
+    """Return the view of a camera on a body; `up` is the vertical in the body's frame.
 
-    The floor is where the height above it is 0 within a tolerance t that grows with the depth z:
+    A pixel shows the floor if its height is 0 within a tolerance t, which grows with the depth z:
 
         t(z) = 5 mm + tan(0.5 deg) (|a| + |b|) z + 3 * 1.5 mm / m^2 z^2 |s|
 
-    by the mounting's place, its pitch and roll (a and b are the ray's ways ahead and aside per
-    metre of depth), and the noise of the depth (s is its way up). Straight ahead of a camera 0.1 m
-    up that is 10 mm at 0.5 m, 15 mm at 1 m and 24 mm at 2 m: a thing of 3 cm counts up to 2.5 m,
-    if it fills three pixels. A body that is tilted stands on a slope, or on a sill: nothing is an
-    obstacle that would be the floor of one of the two.
+    The terms come from the mounting's position, its pitch and roll, and the depth's noise. Per
+    metre of depth, a ray goes a ahead, b aside and s up. Straight ahead of a camera 0.1 m up, t is
+    10 mm at 0.5 m, 15 mm at 1 m and 24 mm at 2 m. So an object of 3 cm counts up to 2.5 m, if it
+    fills three pixels. A tilted body stands on a slope or on a sill: a surface that is the floor
+    in one of these cases is no obstacle.
     """
     view, rays, angle, known = _level(body, camera)
     if up == (0.0, 0.0):
@@ -106,12 +106,12 @@ def view_of(body: BodyDescription, camera: Camera, up: Up = (0.0, 0.0)) -> View:
 
 @lru_cache(maxsize=MAX_CAMERAS)
 def _level(body: BodyDescription, camera: Camera) -> _Level:
-    """Return the view of a camera on a level body; this takes far longer than another tilt."""
+    """Return the view of a camera on a level body. A view of another tilt is much faster."""
     mount, (rays, known) = np.array((camera.x, camera.y, camera.z)), _rays(camera)
     ahead = np.array((math.cos(camera.yaw), math.sin(camera.yaw)))
     aside = np.array((-ahead[1], ahead[0]))
-    way = np.abs(rays[..., :2] @ ahead) + np.abs(rays[..., :2] @ aside)
-    angle, height, slope = math.tan(MOUNT_RAD) * way, camera.z, rays[..., 2]
+    across = np.abs(rays[..., :2] @ ahead) + np.abs(rays[..., :2] @ aside)
+    angle, height, slope = math.tan(MOUNT_RAD) * across, camera.z, rays[..., 2]
     above, top, below = _bounds(height, slope, angle, body.body_height)
     with np.errstate(divide="ignore", invalid="ignore"):
         floor = np.where(slope < 0, -height / slope, np.inf)
@@ -139,9 +139,9 @@ def _level(body: BodyDescription, camera: Camera) -> _Level:
 
 
 def _rays(camera: Camera) -> tuple[Floats, Mask]:
-    """Return the direction of every second pixel in the body's frame, (h, w, 3), 1 m of depth.
+    """Return the rays of every second pixel in the body's frame (h, w, 3), for 1 m of depth.
 
-    And the pixels (h, w) for which that is known: no light reaches the others through the lens.
+    The mask (h, w) has the pixels with a known ray; the lens shows nothing in the others.
     """
     fx, fy, cx, cy = camera.pinhole
     right, down = np.meshgrid(
@@ -149,16 +149,16 @@ def _rays(camera: Camera) -> tuple[Floats, Mask]:
     )
     seen_x, seen_y = right, down
     for _ in range(UNDISTORT_STEPS if camera.distortion else 0):
-        x, y = _distorted(camera, right, down)
-        right = (right + (seen_x - x)).clip(-WIDEST, WIDEST)
-        down = (down + (seen_y - y)).clip(-WIDEST, WIDEST)
-    x, y = _distorted(camera, right, down)
+        x, y = _distort(camera, right, down)
+        right = (right + (seen_x - x)).clip(-MAX_ASIDE_M, MAX_ASIDE_M)
+        down = (down + (seen_y - y)).clip(-MAX_ASIDE_M, MAX_ASIDE_M)
+    x, y = _distort(camera, right, down)
     rays = np.stack([np.ones_like(right), -right, -down], axis=-1) @ turn_of(camera).T
-    return rays, np.hypot(x - seen_x, y - seen_y) < UNDISTORTED
+    return rays, np.hypot(x - seen_x, y - seen_y) < MAX_UNDISTORT_ERROR
 
 
-def _distorted(camera: Camera, x: Floats, y: Floats) -> tuple[Floats, Floats]:
-    """Return where a lens shows what is at x (right) and y (down), 1 m before it."""
+def _distort(camera: Camera, x: Floats, y: Floats) -> tuple[Floats, Floats]:
+    """Return where a lens shows the point at x (right) and y (down), 1 m ahead."""
     k1, k2, p1, p2, k3, k4, k5, k6 = (*camera.distortion, *[0.0] * 8)[:8]
     square = x * x + y * y
     radial = 1.0 + square * (k1 + square * (k2 + square * k3))
@@ -185,22 +185,22 @@ def turn_of(camera: Camera) -> Floats:
 def _bounds(
     height: float, slope: Floats, angle: Floats, body_height: float
 ) -> tuple[Pixels, Pixels, Pixels]:
-    """Return depths by pixel [mm]: above the floor, below the body's top, below the floor.
+    """Return the depths `above`, below the body's top, and `below` by pixel [mm]; see View.
 
     The height at depth z is h + s z, and its tolerance t + a z + q z^2.
     """
     noise, falls = SIGMAS * NOISE_PER_M2 * np.abs(slope), angle - slope
     return (
-        _crossed(height - MOUNT_M, falls, noise),
-        _crossed(body_height - height, -falls, -noise),
-        _crossed(height + MOUNT_M, -slope - angle, -noise),
+        _depths_at(height - MOUNT_M, falls, noise),
+        _depths_at(body_height - height, -falls, -noise),
+        _depths_at(height + MOUNT_M, -slope - angle, -noise),
     )
 
 
-def _crossed(height: float, slope: Floats, noise: Floats) -> Pixels:
+def _depths_at(height: float, slope: Floats, noise: Floats) -> Pixels:
     """Return the depths z [mm] at which s z + q z^2 is `height`: 2 h / (s + sqrt(s^2 + 4 q h)).
 
-    It works in place: where the tilt changes, this is done for each picture.
+    It works in place to save time: while the tilt changes, it runs for each picture.
     """
     height = max(0.0, height)
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -223,7 +223,7 @@ def _reach(mount: Floats, rays: Floats, reach: float) -> Floats:
 
 
 def _inside(body: BodyDescription, mount: Floats, rays: Floats) -> Floats:
-    """Return the depths (h, w) [m] up to which rays are over the body's footprint; 0 without."""
+    """Return the depths (h, w) [m] up to which rays are over the footprint; 0 outside it."""
     hull = edges(body.footprint)
     room = hull.offsets - hull.normals @ mount[:2]
     if (room <= 0).any():
@@ -235,29 +235,31 @@ def _inside(body: BodyDescription, mount: Floats, rays: Floats) -> Floats:
 
 
 def _millimetres(depth: Floats) -> Pixels:
-    """Return depths [m] >= 0 in millimetres; NEVER for one that is not known."""
+    """Return depths [m] >= 0 in millimetres; NEVER for nan."""
     depth = depth * 1000.0
     return np.fmin(depth, NEVER, out=depth).astype(np.uint16)
 
 
 def unknown(camera: Camera, picture: Pixels) -> Mask:
-    """Return the pixels (h, w) without a depth that the camera can measure."""
-    dark: Mask = (picture == 0) | (picture > _farthest(camera))
+    """Return a mask (h, w) of the pixels without a depth in the camera's range."""
+    dark: Mask = (picture == 0) | (picture > _max_depth_mm(camera))
     return dark
 
 
-def _farthest(camera: Camera) -> int:
+def _max_depth_mm(camera: Camera) -> int:
     return min(NEVER - 1, round(camera.depth_max * 1000.0))
 
 
 def blind(camera: Camera, view: View, picture: Pixels) -> bool:
-    """Return whether next to nothing is known of the floor that must be seen.
+    """Return whether nearly all of the floor that must be visible is unknown.
 
-    A camera that looks over it is blind where next to nothing is known at all.
+    A camera that looks over the floor is blind if nearly the whole picture is unknown.
     """
     dark = unknown(camera, picture)
     floor = dark[view.sure]
-    watched, share = (floor, BLIND_FLOOR) if 20 * floor.size >= dark.size else (dark, BLIND)
+    watched, share = (
+        (floor, MAX_UNKNOWN_FLOOR) if 20 * floor.size >= dark.size else (dark, MAX_UNKNOWN)
+    )
     return bool(np.count_nonzero(watched) > share * watched.size)
 
 
@@ -268,21 +270,21 @@ def sight(body: BodyDescription, camera: Camera, view: View, picture: Pixels) ->
     """
     dark = unknown(camera, picture)
     hull = edges(body.footprint)
-    # 0 wraps round: it is no depth
-    stands = ((picture - np.uint16(1)) < view.within) & (picture > view.own)
+    # 0, which is no depth, wraps around to the maximum
+    standing = ((picture - np.uint16(1)) < view.within) & (picture > view.own)
     found: list[tuple[Floats, bool, bool]] = []
-    if stands.any():
-        beside, metres = _alike(stands, picture), picture * np.float32(0.001)
-        sure, doubtful = beside >= CERTAIN_BESIDE, stands & (beside >= BESIDE)
-        for points, known in _nearest(view, stands & sure, doubtful, metres):
+    if standing.any():
+        alike, metres = _count_alike(standing, picture), picture * np.float32(0.001)
+        sure, doubtful = alike >= SURE_NEIGHBOURS, standing & (alike >= MIN_NEIGHBOURS)
+        for points, known in _nearest(view, standing & sure, doubtful, metres):
             found.append((points[outside(hull, points[:, :2]) > 0], False, known))
     hole = (picture > view.below) & ~dark
-    holes = _beside(hole) if hole.any() else hole.view(np.uint8)
-    gap = _squares(hole | (dark & view.sure))
-    doubtful = (hole & (holes >= HOLE_BESIDE)) | gap
+    beside = _count_neighbours(hole) if hole.any() else hole.view(np.uint8)
+    gap = _gap_centers(hole | (dark & view.sure))
+    doubtful = (hole & (beside >= MIN_HOLE_NEIGHBOURS)) | gap
     if doubtful.any():
         for points, known in _nearest(
-            view, hole & (holes >= CERTAIN_HOLE_BESIDE), doubtful, view.floor
+            view, hole & (beside >= SURE_HOLE_NEIGHBOURS), doubtful, view.floor
         ):
             found.append((points, True, known))
     if not found:
@@ -300,72 +302,72 @@ def _nearest(
 ) -> tuple[tuple[Floats, bool], tuple[Floats, bool]]:
     """Return the nearest points (n, 3) [m] in each column, at depths `metres` (h, w).
 
-    First those that are `sure`, then those `doubtful` ones that are nearer still.
+    These are the `sure` points, then the `doubtful` ones that are nearer still.
     """
-    way, rays = metres * view.flat, view.rays
+    distance, rays = metres * view.flat, view.rays
     if not view.upright:
-        way, metres, rays = way.T, metres.T, rays.transpose(1, 0, 2)
+        distance, metres, rays = distance.T, metres.T, rays.transpose(1, 0, 2)
         sure, doubtful = sure.T, doubtful.T
-    column, found = np.arange(way.shape[1]), []
-    least = np.full(way.shape[1], np.inf, np.float32)
+    column, found = np.arange(distance.shape[1]), []
+    limit = np.full(distance.shape[1], np.inf, np.float32)
     for mask, known in ((sure, True), (doubtful, False)):
-        away = np.where(mask, way, np.float32(np.inf))
-        row = away.argmin(axis=0)
-        nearest = away[row, column]
-        nearer = np.flatnonzero(nearest < least)
-        least = np.minimum(least, nearest)
+        masked = np.where(mask, distance, np.float32(np.inf))
+        row = masked.argmin(axis=0)
+        nearest = masked[row, column]
+        nearer = np.flatnonzero(nearest < limit)
+        limit = np.minimum(limit, nearest)
         row = row[nearer]
         points = metres[row, nearer, None].astype(np.float64) * rays[row, nearer]
         found.append((view.mount + points, known))
     return found[0], found[1]
 
 
-def _beside(mask: Mask) -> NDArray[np.uint8]:
-    """Return how many of its 8 neighbours are in `mask` too, for each of its pixels."""
+def _count_neighbours(mask: Mask) -> NDArray[np.uint8]:
+    """Return for each pixel how many of its 8 neighbours are in `mask`."""
     padded = np.pad(mask.view(np.uint8), 1, mode="edge")
     rows = padded[:-2] + padded[1:-1] + padded[2:]
     around: NDArray[np.uint8] = rows[:, :-2] + rows[:, 1:-1] + rows[:, 2:]
     return around - mask
 
 
-def _squares(mask: Mask) -> Mask:
-    """Return the middles of all squares of GAP_PX pixels that are in `mask`."""
+def _gap_centers(mask: Mask) -> Mask:
+    """Return a mask of the middles of all squares of GAP_PX pixels in `mask`."""
     found = np.pad(mask, GAP_PX // 2, mode="edge")
     for _ in range(GAP_PX - 1):
         found = found[1:, 1:] & found[:-1, 1:] & found[1:, :-1] & found[:-1, :-1]
     return found
 
 
-def _alike(mask: Mask, picture: Pixels) -> NDArray[np.uint8]:
-    """Return how many of its 8 neighbours in `mask` have about its depth, for each pixel."""
+def _count_alike(mask: Mask, picture: Pixels) -> NDArray[np.uint8]:
+    """Return for each pixel how many of its 8 neighbours in `mask` have a similar depth."""
     count = np.zeros(mask.shape, np.uint8)
     depth = picture.astype(np.int32)
-    most = depth // round(1 / ALIKE_SHARE) + round(1000 * ALIKE_M)
-    here, there = slice(None, -1), slice(1, None)
+    max_mm = depth // round(1 / ALIKE_SHARE) + round(1000 * ALIKE_M)
+    head, tail = slice(None, -1), slice(1, None)
     whole = slice(None)
-    for one, other in (
-        ((whole, here), (whole, there)),
-        ((here, whole), (there, whole)),
-        ((here, here), (there, there)),
-        ((here, there), (there, here)),
+    for first, second in (
+        ((whole, head), (whole, tail)),
+        ((head, whole), (tail, whole)),
+        ((head, head), (tail, tail)),
+        ((head, tail), (tail, head)),
     ):
-        alike = np.abs(depth[one] - depth[other]) <= most[one]
-        alike &= mask[one] & mask[other]
-        count[one] += alike
-        count[other] += alike
+        alike = np.abs(depth[first] - depth[second]) <= max_mm[first]
+        alike &= mask[first] & mask[second]
+        count[first] += alike
+        count[second] += alike
     return count
 
 
 def seen_through(camera: Camera, view: View, picture: Pixels, points: Floats, hole: Mask) -> Mask:
-    """Return which `points` (n, 3) [m] in the body's frame the picture shows to be gone.
+    """Return a mask of the `points` (n, 3) [m], in the body's frame, that are gone.
 
-    A thing is gone where the picture looks past it, or shows the floor; a hole where the picture
-    shows the floor. What is unknown shows nothing.
+    An object is gone if the picture shows the floor, or anything farther. A hole is gone if the
+    picture shows the floor. Unknown pixels show nothing.
     """
     seen = (points - view.mount) @ turn_of(camera)
     fx, fy, cx, cy = camera.pinhole
     depth = np.maximum(seen[:, 0], 1e-6)
-    right, down = _distorted(camera, -seen[:, 1] / depth, -seen[:, 2] / depth)
+    right, down = _distort(camera, -seen[:, 1] / depth, -seen[:, 2] / depth)
     height, width = picture.shape
     column = np.rint((cx + fx * right) / 2).clip(-1, width).astype(np.intp)
     row = np.rint((cy + fy * down) / 2).clip(-1, height).astype(np.intp)

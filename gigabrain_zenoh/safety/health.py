@@ -18,16 +18,16 @@ from gigabrain_zenoh.gate.state import BRAIN
 from gigabrain_zenoh.host.bounded import percentile
 from gigabrain_zenoh.safety.catalogue import cause, lasting, ticks_of
 
-CONFIRM_STATES = 3  # in a row that measure something, before the body counts as measuring it
-MEDIAN_STATES = 25  # of charges; the median of 0.5 s ignores a sag of 0.2 s
+CONFIRM_STATES = 3  # in a row with a value, before the body is known to measure it
+MEDIAN_STATES = 25  # with a charge; the median of 0.5 s ignores a sag of 0.2 s
 CLEAR_PERCENT, CLEAR_DEG_C = 2.0, 2.0  # hysteresis of the thresholds
 MIN_DEG_C, MAX_DEG_C = -40.0, 150.0  # beyond these a motor's sensor is faulty
 TILT_TICKS = 10  # 0.2 s, longer than a bump in the floor
-UNIT_TOLERANCE = 0.1  # of the length of an orientation quaternion
+UNIT_TOLERANCE = 0.1  # error of an orientation quaternion's length
 SYSTEMS = ("perception", "decision", "control")
-MAX_AGES = 100  # of the newest commands, two seconds
+MAX_AGES = 100  # newest commands, two seconds
 AGE_PERCENTILE = 0.99
-SILENT_TICKS = 50  # a second without commands, after which earlier ones tell nothing
+SILENT_TICKS = 50  # 1 s without commands, after which earlier ages are forgotten
 HALF_SPEED = 0.5
 HOST_CODES = ("disk_low", "cpu_busy", "memory_low")  # depend on the computer, not on messages
 
@@ -49,7 +49,7 @@ class Power(Struct, frozen=True, kw_only=True):
     hot_ticks: int = 0
     measured: tuple[Measured, ...] = ()  # of the newest states
     charged: bool = False  # the body measures its charge
-    volts: bool = False  # and its voltage
+    volts: bool = False  # the body measures its voltage
     motors: frozenset[str] = frozenset()  # whose temperature the body measures
     charge_missing_ticks: int = 0
     motor_missing_ticks: int = 0
@@ -73,15 +73,15 @@ class Power(Struct, frozen=True, kw_only=True):
         missing = now.charged and battery is None
         return replace(
             now,
-            low_ticks=now._low(limits, elapsed),
-            warm_ticks=_over(limits, now.warm_ticks, hottest, limits.motor_warn, elapsed),
-            hot_ticks=_over(limits, now.hot_ticks, hottest, limits.motor_stop, elapsed),
+            low_ticks=now._count_low(limits, elapsed),
+            warm_ticks=_count_hot(limits, now.warm_ticks, hottest, limits.motor_warn, elapsed),
+            hot_ticks=_count_hot(limits, now.hot_ticks, hottest, limits.motor_stop, elapsed),
             charge_missing_ticks=lasting(now.charge_missing_ticks, missing, elapsed),
             motor_missing_ticks=lasting(now.motor_missing_ticks, lost, elapsed),
         )
 
     def causes(self, limits: Thresholds) -> tuple[Cause, ...]:
-        """Return why the body must stop."""
+        """Return the causes that stop the body."""
         found = []
         if self.low_ticks[2] >= ticks_of(limits.battery_sustain):
             found.append(cause("battery_empty", f"battery at or below {limits.battery_stop:g} %"))
@@ -94,7 +94,7 @@ class Power(Struct, frozen=True, kw_only=True):
         return tuple(found)
 
     def warnings(self, limits: Thresholds, state: RobotState) -> tuple[Cause, ...]:
-        """Return warnings of what will stop the body next."""
+        """Return warnings before battery or motors stop the body."""
         found = []
         low = [ticks >= ticks_of(limits.battery_sustain) for ticks in self.low_ticks]
         if low[1]:
@@ -109,26 +109,26 @@ class Power(Struct, frozen=True, kw_only=True):
         return tuple(found)
 
     def _confirmed(self, now: Measured) -> "Power":
-        """Return what the body measures: only what CONFIRM_STATES states in a row contained."""
+        """Add the values that the last CONFIRM_STATES states contained to the measured ones."""
         newest = (*self.measured, now)[-CONFIRM_STATES:]
         power = replace(self, measured=newest)
         if len(newest) < CONFIRM_STATES:
             return power
-        motors = frozenset.intersection(*(one.motors for one in newest))
+        motors = frozenset.intersection(*(each.motors for each in newest))
         return replace(
             power,
-            charged=power.charged or all(one.charge for one in newest),
-            volts=power.volts or all(one.volts for one in newest),
+            charged=power.charged or all(each.charge for each in newest),
+            volts=power.volts or all(each.volts for each in newest),
             motors=power.motors if motors <= power.motors else power.motors | motors,
         )
 
-    def _low(self, limits: Thresholds, elapsed: int) -> tuple[int, int, int]:
+    def _count_low(self, limits: Thresholds, elapsed: int) -> tuple[int, int, int]:
         if not self.charges:
             return self.low_ticks
-        charge, enough = self.charge, ticks_of(limits.battery_sustain)
+        charge, sustain = self.charge, ticks_of(limits.battery_sustain)
 
         def count(ticks: int, threshold: float) -> int:
-            clear = CLEAR_PERCENT if ticks >= enough else 0.0
+            clear = CLEAR_PERCENT if ticks >= sustain else 0.0
             return lasting(ticks, charge <= threshold + clear, elapsed)
 
         warn, home, stop = self.low_ticks
@@ -140,7 +140,7 @@ class Power(Struct, frozen=True, kw_only=True):
 
 
 def _plausible(battery: Battery | None, volts: bool) -> bool:
-    """Return whether a battery is plausible: after it had a voltage, none is a fault."""
+    """Return whether battery data are valid; 0 V is not, once `volts` are measured."""
     return battery is not None and (battery.voltage > 0 or not volts)
 
 
@@ -150,7 +150,9 @@ def _temperatures(state: RobotState) -> dict[str, float]:
     return {name: t for name, t in found if t is not None and MIN_DEG_C < t < MAX_DEG_C}
 
 
-def _over(limits: Thresholds, ticks: int, hottest: float, threshold: float, elapsed: int) -> int:
+def _count_hot(
+    limits: Thresholds, ticks: int, hottest: float, threshold: float, elapsed: int
+) -> int:
     clear = CLEAR_DEG_C if ticks >= ticks_of(limits.motor_sustain) else 0.0
     return lasting(ticks, hottest >= threshold - clear, elapsed)
 
@@ -177,7 +179,7 @@ class Attitude(Struct, frozen=True, kw_only=True):
 
     @property
     def causes(self) -> tuple[Cause, ...]:
-        """Return the causes for which the body must stop, until a person releases it."""
+        """Return the causes that stop the body until a person releases it."""
         found = [("tilted", self.tilted_ticks >= TILT_TICKS), ("collision", self.hit)]
         return tuple(cause(code) for code, wrong in found if wrong)
 
@@ -215,7 +217,7 @@ class Host(Struct, frozen=True, kw_only=True):
 
 
 class Bases(Struct, frozen=True, kw_only=True):
-    """Ticks of the sensor data that the newest messages rest on; 0 for none."""
+    """Ticks of the sensor data that the newest messages are based on; 0 for none."""
 
     scan: int = 0
     world: int = 0
@@ -247,11 +249,11 @@ class PipelineProgress(Struct, frozen=True, kw_only=True):
         first: bool,
         needed: tuple[str, ...] = SYSTEMS,
     ) -> tuple[Cause, ...]:
-        """Return why the body must stop; `silent` names the systems without fresh messages.
+        """Return the causes that stop the body; `silent` are the systems without fresh messages.
 
-        The brain matters only while it drives, or may drive next. If no commander drives and all
-        systems that the body needs are silent, there is no brain, and a script need not wait for
-        one. With the `first` scan that cannot be known yet.
+        The brain only matters while it drives, or may drive next. If nobody drives and all systems
+        that the body needs are silent, there is no brain, and a script need not wait for one. At
+        the `first` scan this is not known yet.
         """
         commander = state.gate.commander
         brainless = not commander and set(silent) >= set(needed) and not first
@@ -270,29 +272,29 @@ class RoundTrip(Struct, frozen=True, kw_only=True):
     commander: str = ""
     ages: tuple[int, ...] = ()  # of its newest commands [ticks]
     late_ticks: int = 0  # up to the newest command
-    silent_ticks: int = 0  # since that
+    silent_ticks: int = 0  # since the newest command
 
     def then(
         self, limits: Thresholds, commander: str, ages: tuple[int, ...], elapsed: int
     ) -> "RoundTrip":
         """Return the monitor after one more state, with the ages of new commands [ticks].
 
-        It begins again with another commander, and when one has been silent for a second.
+        It starts again with another commander, and after a second without commands.
         """
         last = self if commander == self.commander else RoundTrip(commander=commander)
         silent = last.silent_ticks + elapsed
         if not ages:
-            over = silent >= SILENT_TICKS
-            return RoundTrip(commander=commander) if over else replace(last, silent_ticks=silent)
+            ended = silent >= SILENT_TICKS
+            return RoundTrip(commander=commander) if ended else replace(last, silent_ticks=silent)
         newest = (*last.ages, *ages)[-MAX_AGES:]
         slowest = percentile(sorted(newest), AGE_PERCENTILE) or 0
         late = slowest * TICK_NS > limits.round_trip * 1e9
-        passed = silent if last.late_ticks else max(1, elapsed)  # two verdicts may have one tick
+        passed = silent if last.late_ticks else max(1, elapsed)  # two verdicts may share a tick
         late_ticks = lasting(last.late_ticks, late, passed)
         return RoundTrip(commander=commander, ages=newest, late_ticks=late_ticks)
 
     def causes(self, limits: Thresholds) -> tuple[Cause, ...]:
-        """Return why the body must go at half speed."""
+        """Return the cause that halves the speed."""
         if self.late_ticks < ticks_of(limits.round_trip_sustain):
             return ()
         text = f"commands take more than {limits.round_trip * 1e3:.0f} ms"
@@ -302,15 +304,15 @@ class RoundTrip(Struct, frozen=True, kw_only=True):
 def halved(body: BodyDescription, caps: SpeedCaps) -> SpeedCaps:
     """Return `caps`, limited to half the body's speed in each direction."""
 
-    def least(cap: float | None, most: float) -> float:
-        return HALF_SPEED * most if cap is None else min(cap, HALF_SPEED * most)
+    def lower(cap: float | None, limit: float) -> float:
+        return HALF_SPEED * limit if cap is None else min(cap, HALF_SPEED * limit)
 
     return SpeedCaps(
-        forward=least(caps.forward, body.max_linear_speed),
-        backward=least(caps.backward, body.max_linear_speed),
-        left=least(caps.left, body.max_lateral_speed),
-        right=least(caps.right, body.max_lateral_speed),
-        rotation=least(caps.rotation, body.max_angular_speed),
+        forward=lower(caps.forward, body.max_linear_speed),
+        backward=lower(caps.backward, body.max_linear_speed),
+        left=lower(caps.left, body.max_lateral_speed),
+        right=lower(caps.right, body.max_lateral_speed),
+        rotation=lower(caps.rotation, body.max_angular_speed),
         turn_left=caps.turn_left,
         turn_right=caps.turn_right,
     )

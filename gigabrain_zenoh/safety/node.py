@@ -1,4 +1,4 @@
-"""Safety node: a verdict per scan and per second state, and at once when it changes."""
+"""Safety node: publishes a verdict for each scan, every second state, and each change."""
 
 import logging
 import shutil
@@ -50,7 +50,7 @@ from gigabrain_zenoh.safety.health import SYSTEMS, Bases, Host, horizontal
 from gigabrain_zenoh.safety.step import SafetyInputs, SafetyMemory, step
 
 HOST_PERIOD_NS = 1_000_000_000
-HOST_SAMPLES = 10  # of the CPU share, averaged over ten seconds
+HOST_SAMPLES = 10  # of the CPU load, averaged over ten seconds
 log = logging.getLogger("gigabrain_zenoh.safety")
 
 
@@ -66,7 +66,7 @@ async def run(bus: Bus, ready: Callable[[], None], probe: "HostProbe | None" = N
             return
         before, state = memory, inputs.state
         memory, verdict = step(body.description, memory, inputs)
-        # joints do not move by a verdict that is some ticks old
+        # joints need a verdict of the newest tick
         repeat = 1 if body.description.joints else REPEAT_TICKS
         due = state.tick - last_tick >= repeat or state.boot != before.boot
         new = memory.field.basis != before.field.basis
@@ -89,17 +89,17 @@ def _differs(now: SafetyState, before: SafetyState) -> bool:
 
 
 def _log_changes(state: RobotState, before: SafetyState, now: SafetyState) -> None:
-    """Log causes and warnings that begin or end, from the first enable on."""
+    """Log causes and warnings that begin or end, once the robot has been enabled."""
     if not state.gate.enables:
         return
     level = logging.WARNING if now.verdict == "stop" else logging.INFO
-    if fresh := _missing(now.causes, before.causes):
-        _log(level, f"{now.verdict}: {in_words(fresh)}", "held back", fresh)
-    if fresh := _missing(now.warnings, before.warnings):
-        _log(logging.WARNING, f"warning: {in_words(fresh)}", "warned", fresh)
-    over = _missing((*before.causes, *before.warnings), (*now.causes, *now.warnings))
-    if over:
-        _log(logging.INFO, f"over: {'; '.join(cause.text for cause in over)}", "over", over)
+    if begun := _missing(now.causes, before.causes):
+        _log(level, f"{now.verdict}: {in_words(begun)}", "held back", begun)
+    if begun := _missing(now.warnings, before.warnings):
+        _log(logging.WARNING, f"warning: {in_words(begun)}", "warned", begun)
+    ended = _missing((*before.causes, *before.warnings), (*now.causes, *now.warnings))
+    if ended:
+        _log(logging.INFO, f"over: {'; '.join(cause.text for cause in ended)}", "over", ended)
 
 
 def _missing(causes: tuple[Cause, ...], known: tuple[Cause, ...]) -> tuple[Cause, ...]:
@@ -162,8 +162,8 @@ def _free_mb(folder: Path) -> float | None:
 
 # subscribed only so that invalid messages on topics without another subscriber are counted
 COUNTED_TOPICS: tuple[Topic[Any], ...] = (IMAGE, POSE, MAP, HEALTH, LOG)
-MAX_KEPT = 256  # messages between two states
-WORLD_MARGIN_NS = 50_000_000  # added to the limit for scans: a world comes after its scan
+MAX_QUEUED = 256  # messages between two states
+WORLD_MARGIN_NS = 50_000_000  # added to the age limit of scans: a world comes after its scan
 
 
 class InputCollector:
@@ -172,14 +172,14 @@ class InputCollector:
     def __init__(self, bus: Bus, on_new: Callable[[Message], None], probe: HostProbe) -> None:
         self._bus, self._probe, self._on_new = bus, probe, on_new
         self._pictures: dict[str, Latest[DepthImage]] = {}  # by camera of the body
-        self._sees = False  # it listens to pictures
+        self._depth_subscribed = False
         self._by_commander: dict[str, PreviousTick[CmdVel]] = {}
-        # age [ticks] and source; tick, and horizontal acceleration [m/s2]
-        self._echoes: deque[tuple[int, str]] = deque(maxlen=MAX_KEPT)
-        self._shocks: deque[tuple[int, float]] = deque(maxlen=MAX_KEPT)
+        # echoes: age [ticks], source; shocks: tick, horizontal acceleration [m/s2]
+        self._echoes: deque[tuple[int, str]] = deque(maxlen=MAX_QUEUED)
+        self._shocks: deque[tuple[int, float]] = deque(maxlen=MAX_QUEUED)
         self._commands = Latest(CMD_VEL, bus.clock, bus.time)  # the brain's
         self._joint_commands = Latest(JOINT_CMD, bus.clock, bus.time)
-        self._command_key, self._unsubscribe = CMD_VEL.key, _nothing
+        self._command_key, self._unsubscribe = CMD_VEL.key, _no_subscription
         self._shape: tuple[ArmModel, Arm | None, ArmShape | None, str] | None = None
         self._arm_models = bus.latest(ARM_MODEL)
         self.bodies = bus.latest(BODY, self._on_body)
@@ -195,7 +195,7 @@ class InputCollector:
     def inputs(self, body: BodyDescription) -> SafetyInputs | None:
         """Return the present inputs; None without a state.
 
-        None too after a scan of a tick whose state has not arrived yet.
+        It also returns None while the newest state is older than the newest scan.
         """
         state = self._states.fresh()
         if state is None or state.tick < self._bus.time.tick:
@@ -221,17 +221,17 @@ class InputCollector:
         )
 
     def _arm(self, body: BodyDescription) -> tuple[ArmShape | None, str]:
-        """Return the shapes of the body's arm, or why there are none; compiled once a model."""
+        """Return the shapes of the body's arm, or the problem; each model is compiled once."""
         model = self._arm_models.current
         if body.arm is None or model is None:
             return None, "no model of the arm has come yet" if body.arm else ""
-        known = self._shape
-        if known is None or known[:2] != (model, body.arm):
-            known = self._shape = (model, body.arm, *arm_shape(model.mjcf, body))
-        return known[2:]
+        cached = self._shape
+        if cached is None or cached[:2] != (model, body.arm):
+            cached = self._shape = (model, body.arm, *arm_shape(model.mjcf, body))
+        return cached[2:]
 
     def _newest_pictures(self) -> Pictures:
-        newest = ((name, one.current, one.age_ns()) for name, one in self._pictures.items())
+        newest = ((name, each.current, each.age_ns()) for name, each in self._pictures.items())
         return {name: Picture(image=image, age_ns=age or 0) for name, image, age in newest if image}
 
     def _silent(self, body: BodyDescription) -> tuple[str, ...]:
@@ -246,7 +246,7 @@ class InputCollector:
         )
 
     def _control(self, body: BodyDescription) -> Latest[Any]:
-        """Return the newest command by which control shows that it works."""
+        """Return the commands that show whether control works."""
         return self._commands if body.has_base else self._joint_commands
 
     def _bases(self, body: BodyDescription) -> Bases:
@@ -272,7 +272,7 @@ class InputCollector:
         """
         shock = max((value for tick, value in self._shocks if tick < state.tick), default=0.0)
         later = [(tick, value) for tick, value in self._shocks if tick >= state.tick]
-        self._shocks = deque(later, maxlen=MAX_KEPT)
+        self._shocks = deque(later, maxlen=MAX_QUEUED)
         return shock
 
     def _on_command(self, _key: str, command: CmdVel) -> None:
@@ -300,7 +300,7 @@ class InputCollector:
             self._shocks.append((imu.tick, horizontal(imu.linear_acceleration)))
 
     def _on_picture(self, key: str, image: DepthImage) -> None:
-        """Keep a picture. One of the future is not: it would keep the present ones out."""
+        """Store a picture. One of the future is refused: it would make present ones look old."""
         latest = self._pictures.get(key.removeprefix(f"{DEPTH.key}/"))
         if latest is None or max(image.basis, image.tick) > self._bus.time.tick + LEAD_TICKS:
             self._bus.counters["refused_pictures"] += 1
@@ -312,24 +312,24 @@ class InputCollector:
             self._on_new(image)
 
     def _on_body(self, body: Body) -> None:
-        """Subscribe to its cameras, and to the topic that its driver obeys if it is another."""
+        """Subscribe to the body's cameras, and to its command topic if it is not CMD_VEL."""
         names = [camera.name for camera in depth_cameras(body.description)]
         if names != list(self._pictures):
             self._pictures = {n: Latest(DEPTH, self._bus.clock, self._bus.time) for n in names}
-        if names and not self._sees:
-            self._sees = True
+        if names and not self._depth_subscribed:
+            self._depth_subscribed = True
             self._bus.subscribe(DEPTH, self._on_picture)
         topic = command_topic(body.description)
         if topic.key == self._command_key:
             return
         self._unsubscribe()
-        self._command_key, self._unsubscribe = topic.key, _nothing
+        self._command_key, self._unsubscribe = topic.key, _no_subscription
         if topic.key != CMD_VEL.key:
             self._unsubscribe = self._bus.subscribe(topic, self._on_command)
 
 
 def arm_shape(mjcf: str, body: BodyDescription) -> tuple[ArmShape | None, str]:
-    """Return the shapes of an arm, or the problem with them; MuJoCo is imported here alone."""
+    """Return the shapes of an arm, or the problem with them. Only this imports MuJoCo."""
     try:
         from gigabrain_zenoh.safety.arm_shape import MujocoArm
 
@@ -340,5 +340,5 @@ def arm_shape(mjcf: str, body: BodyDescription) -> tuple[ArmShape | None, str]:
         return None, str(error)
 
 
-def _nothing() -> None:
-    """Stand for an unsubscribe function where there is no subscription."""
+def _no_subscription() -> None:
+    """Do nothing; the unsubscribe function without a subscription."""

@@ -1,4 +1,4 @@
-"""One verdict of all monitors. A pure function; their state is in SafetyMemory."""
+"""Combines all monitors into one verdict. Pure functions; SafetyMemory has the state."""
 
 from msgspec import Struct
 from msgspec.structs import replace
@@ -29,12 +29,12 @@ from gigabrain_zenoh.safety.latency import DataLatency
 from gigabrain_zenoh.safety.tracking_error import TrackingError
 from gigabrain_zenoh.safety.zones import Motion, ProtectiveField
 
-LATCHING_TICKS = 10  # how long a cause that latches is repeated: a busy gate may miss a verdict
-SCANS_TO_START = 2  # by the second, the answer to the first has arrived, however slow
+LATCHING_TICKS = 10  # a latching cause is repeated, as a busy gate may miss a verdict
+SCANS_TO_START = 2  # by the second, even a slow brain has answered the first
 
 
 class SafetyInputs(Struct, frozen=True, kw_only=True):
-    """SafetyInputs of one verdict."""
+    """Inputs of one verdict."""
 
     state: RobotState
     scan: LaserScan | None = None  # newest of this boot, however old
@@ -46,12 +46,12 @@ class SafetyInputs(Struct, frozen=True, kw_only=True):
     echo_ages: tuple[int, ...] = ()  # of the commander's commands since the last verdict [ticks]
     shock: float = 0.0  # largest horizontal acceleration since then [m/s2]
     host: Host = Host()
-    arm: ArmShape | None = None  # of a body with an arm, by its model
-    arm_problem: str = ""  # why there is none
+    arm: ArmShape | None = None  # from the model of a body with an arm
+    arm_problem: str = ""  # why `arm` is missing
 
 
 class SafetyMemory(Struct, frozen=True, kw_only=True):
-    """State from tick to tick."""
+    """State of all monitors."""
 
     boot: int = 0
     tick: int = 0
@@ -71,7 +71,7 @@ class SafetyMemory(Struct, frozen=True, kw_only=True):
 def step(
     body: BodyDescription, memory: SafetyMemory, inputs: SafetyInputs
 ) -> tuple[SafetyMemory, SafetyState]:
-    """Return the verdict. Repeated within a tick, it changes only by new inputs."""
+    """Return the next memory and the verdict. Within a tick, only new inputs change it."""
     state, limits = inputs.state, body.thresholds
     if state.boot != memory.boot:  # the driver has restarted
         memory = SafetyMemory(boot=state.boot, tick=state.tick, tracking=TrackingError.start(state))
@@ -97,7 +97,7 @@ def step(
 def _latching(
     recent: tuple[tuple[int, Cause], ...], stop: tuple[Cause, ...], tick: int
 ) -> tuple[tuple[int, Cause], ...]:
-    """Return the causes that latch, present and recent ones, each code with its newest tick."""
+    """Return present and recent latching causes, each code with its newest tick."""
     now = {one.code: (tick, one) for one in stop if one.latching}
     before = (
         (since, one)
@@ -116,11 +116,11 @@ def _observe(body: BodyDescription, memory: SafetyMemory, inputs: SafetyInputs) 
     latency = memory.latency.then(body, state, inputs.scan, history, elapsed)
     late_ticks = latency.late_ticks(body)
     tracking = memory.tracking.then(body, state, command, memory.caps, elapsed, late_ticks)
-    wanted = command if command and command.source == state.gate.commander else None
+    obeyed = command if command and command.source == state.gate.commander else None
     motion = Motion(
         measured=state.velocity,
         commanded=tracking.commanded,
-        requested=velocity_of(wanted) if wanted else ZERO,
+        requested=velocity_of(obeyed) if obeyed else ZERO,
     )
     return SafetyMemory(
         boot=memory.boot,
@@ -157,16 +157,16 @@ def _stop_causes(
 
 
 def needed(body: BodyDescription) -> tuple[str, ...]:
-    """Return the systems that a body waits for: a fixed arm without a lidar has no worlds."""
+    """Return the systems that a body needs: without base and lidar, all but perception."""
     return SYSTEMS if body.has_base or body.lidar else SYSTEMS[1:]
 
 
 def _scan_causes(
     body: BodyDescription, memory: SafetyMemory, inputs: SafetyInputs
 ) -> tuple[Cause, ...]:
-    """Require a recent, plausible scan, by its arrival and by its own tick.
+    """Return a cause unless there is a plausible scan, recent by its arrival and its tick.
 
-    A scan with a future tick is ignored, and does not hide that none has come.
+    A scan with a future tick does not count.
     """
     if body.lidar is None:
         return ()

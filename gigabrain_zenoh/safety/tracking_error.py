@@ -1,8 +1,8 @@
-"""Monitor of the tracking error: whether the measured motion is the commanded one.
+"""Monitor of the tracking error: compares the measured with the commanded motion.
 
-The gate's output is not on the bus, so it is computed again here: the newest command within limits
-and caps, ramped. The body may move at any speed between the least and the greatest of the recent
-outputs, within a tolerance.
+The gate's output is not on the bus, so it is computed here as well: the newest command within
+limits and caps, ramped. The body may move at any speed between the lowest and the highest recent
+output, within a tolerance.
 """
 
 from msgspec import Struct
@@ -17,9 +17,9 @@ from gigabrain_zenoh.geometry.limits import ZERO, Limits, clamp, limits_of, ramp
 from gigabrain_zenoh.geometry.pose import axes, velocity_of
 from gigabrain_zenoh.safety.catalogue import cause, lasting, ticks_of
 
-WINDOW_TICKS = 15  # 0.3 s for the line to the body and back, and for its motors
-MAX_LATE_TICKS = 30  # added to that where data are known to be late
-WATCH_TICKS = 100  # after it was last enabled; later a person may push it
+WINDOW_TICKS = 15  # 0.3 s: the line's round trip, and the motors' delay
+MAX_LATE_TICKS = 30  # added to the window for data that are late
+WATCH_TICKS = 100  # 2 s after the gate was active; later a person may push the body
 
 Axes = tuple[float, float, float]
 Telemetry = tuple[Pose, Velocity, tuple[Joint, ...], ImuData | None]
@@ -29,9 +29,9 @@ class TrackingError(Struct, frozen=True, kw_only=True):
     """Compares commanded and measured motion."""
 
     commanded: Velocity = ZERO  # present output of the gate
-    recent: tuple[Axes, ...] = ()  # those of the newest ticks
+    recent: tuple[Axes, ...] = ()  # outputs of the newest ticks
     telemetry: Telemetry | None = None
-    watch_ticks: int = 0  # for which motion is still judged
+    watch_ticks: int = 0  # until motion is no longer judged
     runaway_ticks: int = 0
     slow_ticks: int = 0
     stuck_ticks: int = 0
@@ -39,7 +39,7 @@ class TrackingError(Struct, frozen=True, kw_only=True):
 
     @classmethod
     def start(cls, state: RobotState) -> "TrackingError":
-        """Return the monitor for a first state, whose motion is taken as the commanded one."""
+        """Return the monitor for a first state; its motion counts as commanded."""
         return cls(commanded=state.velocity, recent=(axes(state.velocity),))
 
     def then(
@@ -79,18 +79,18 @@ class TrackingError(Struct, frozen=True, kw_only=True):
         )
 
     def _odometry_repeats(self, body: BodyDescription, state: RobotState) -> bool:
-        """Return whether pose and velocity repeat while the velocity says that the body moves.
+        """Return whether pose and velocity repeat although the velocity is not 0.
 
-        Those of a body that stands, or is held, may repeat.
+        They may repeat while the body stands, or is held.
         """
         repeats = self.telemetry is not None and self.telemetry[:2] == (state.pose, state.velocity)
         return repeats and not _rests(body, state.velocity)
 
     def causes(self, body: BodyDescription) -> tuple[Cause, ...]:
-        """Return why the body must stop.
+        """Return the causes that stop the body.
 
-        Only a new value ends `telemetry_frozen`, however often the body rests in between: it would
-        otherwise be driven blindly in short moves.
+        Only a new value ends `telemetry_frozen`, even if the body rests in between. Otherwise the
+        body could be driven blindly in short moves.
         """
         limits = body.thresholds
         found = (
@@ -127,17 +127,17 @@ def _rests(body: BodyDescription, measured: Velocity) -> bool:
 def _disobeys(
     body: BodyDescription, recent: tuple[Axes, ...], measured: Velocity
 ) -> tuple[bool, bool]:
-    """Return whether the body moves or turns farther from rest than commanded, and less.
+    """Return whether the body is faster than commanded, and whether it is slower.
 
-    Less counts where it is less than all recent outputs. Control corrects a body that is too slow
-    or too fast, so a share of the speed is no fault.
+    It is slower if its speed is below all recent outputs. Control corrects deviations, so a share
+    of the speed is no fault.
     """
     share = body.control.max_correction
     fast = slow = False
     each = zip(zip(*recent, strict=True), _tolerances(body), axes(measured), strict=True)
     for outputs, tolerance, value in each:
-        least, most = min(outputs), max(outputs)
-        margin = tolerance + share * max(abs(least), abs(most))
-        fast |= value > max(most, 0.0) + margin or value < min(least, 0.0) - margin
-        slow |= 0 <= value < least - margin or 0 >= value > most + margin
+        lowest, highest = min(outputs), max(outputs)
+        margin = tolerance + share * max(abs(lowest), abs(highest))
+        fast |= value > max(highest, 0.0) + margin or value < min(lowest, 0.0) - margin
+        slow |= 0 <= value < lowest - margin or 0 >= value > highest + margin
     return fast, slow

@@ -1,6 +1,6 @@
 """The protective field: free distance in each direction, and the speeds it allows.
 
-It is computed at each scan, and where cameras measure depth at each picture.
+It is computed for each scan, and for each picture of a depth camera.
 """
 
 import math
@@ -24,10 +24,10 @@ from gigabrain_zenoh.safety.catalogue import cause
 from gigabrain_zenoh.safety.tracking_error import Axes
 
 HOUSING_M = 0.1  # nearer hits are the lidar's own housing
-CONE_DEG = 30.0  # ahead, in which some beam must be valid
+CONE_DEG = 30.0  # sector ahead that needs a valid beam
 TURN_MARGIN_M = 0.02  # around a turning body
 MIN_ARC_LINEAR, MIN_ARC_ANGULAR = 0.03, 0.05  # [m/s], [rad/s]; slower motion is no arc
-ZONES = {  # code of the cause, and the text behind a distance [m]; turns have none
+ZONES = {  # code of the cause, and the text after the distance; turns have none
     "forward": ("zone_ahead", "ahead of the body"),
     "backward": ("zone_behind", "behind the body"),
     "left": ("zone_left", "to the left of the body"),
@@ -36,7 +36,7 @@ ZONES = {  # code of the cause, and the text behind a distance [m]; turns have n
     "turn_right": ("zone_turn_right", ""),
 }
 
-Free = dict[str, float | None]  # [m] or [rad] by direction; None where nothing is in the way
+Free = dict[str, float | None]  # [m] or [rad] by direction; None without an obstacle
 
 
 class Motion(Struct, frozen=True, kw_only=True):
@@ -55,11 +55,11 @@ class ProtectiveField(Struct, frozen=True, kw_only=True):
     """The newest free distances, and the directions in which the body has stopped."""
 
     scans: int = 0  # processed so far
-    basis: int = 0  # tick of the newest
-    problem: str = ""  # why that one is not plausible
-    by_scan: Free = {}  # what it leaves free
-    free: Free = {}  # what is left by what cameras saw, too
-    by_camera: frozenset[str] = frozenset()  # directions in which that is the nearest
+    basis: int = 0  # tick of the newest scan
+    problem: str = ""  # with that scan; empty if it is plausible
+    by_scan: Free = {}  # by that scan alone
+    free: Free = {}  # by scan and cameras
+    by_camera: frozenset[str] = frozenset()  # directions with the nearest obstacle by a camera
     stopped: frozenset[str] = frozenset()
     sectors: blind_spots.Ranges = ()
     sectors_at: tuple[int, Pose] | None = None  # tick and odometry pose of their scan
@@ -75,22 +75,22 @@ class ProtectiveField(Struct, frozen=True, kw_only=True):
         motion: Motion,
         pictures: Pictures = NO_PICTURES,
     ) -> "ProtectiveField":
-        """Return the field after a new scan or picture, once the state of its tick has come.
+        """Return the field after a new scan or picture, once the state has reached its tick.
 
-        Zones depend on the speed at that tick. Until the next one the speed caps keep the body
-        from gaining more speed than its zone allows.
+        Zones depend on the speed at that tick. Until the next scan or picture, the caps keep the
+        body from gaining more speed than its zone allows.
         """
         now = self
         if scan and body.lidar and scan.basis != self.basis and scan.basis <= state.tick:
-            now = self._scanned(body, body.lidar, scan, state, history, motion)
+            now = self._with_scan(body, body.lidar, scan, state, history, motion)
         if depth_cameras(body):
             cameras = self.cameras.then(body, pictures, state, history)
             now = replace(now, cameras=cameras)
-            if now.basis == self.basis and cameras.seen == self.cameras.seen:
+            if now.basis == self.basis and cameras.version == self.cameras.version:
                 return now
-        return self if now is self else now._closed(body, state, motion)
+        return self if now is self else now._with_zones(body, state, motion)
 
-    def _scanned(
+    def _with_scan(
         self,
         body: BodyDescription,
         lidar: Lidar,
@@ -99,43 +99,45 @@ class ProtectiveField(Struct, frozen=True, kw_only=True):
         history: PoseHistory,
         motion: Motion,
     ) -> "ProtectiveField":
-        """Return the field with what one scan leaves free."""
+        """Return the field with the free distances by one scan."""
         problem = scan_problem(lidar, scan.ranges_m, HOUSING_M)
         problem = problem or blind_ahead(lidar, scan, HOUSING_M, CONE_DEG)
         now = replace(self, scans=self.scans + 1, basis=scan.basis, problem=problem)
         if problem:
             return replace(now, by_scan={})
         pose = history.at(state.boot, scan.basis) or state.pose
-        moved = self._moved(body, scan.basis, pose, motion.measured)
+        moved = self._distance_since(body, scan.basis, pose, motion.measured)
         sectors, unknown = blind_spots.update(lidar, scan, HOUSING_M, pose.yaw, self.sectors, moved)
         # a body that does not drive may be carried, which the odometry would not show
         driving = state.gate.mode == "enabled"
         past = blind_spots.remember(self.past, body, pose, scan) if driving else ()
         seen = np.stack(hits(lidar, scan, HOUSING_M), axis=1)
-        dark = blind_spots.obstacles(body, pose.yaw, sectors, unknown, HOUSING_M, past)
-        free = _free(body, np.concatenate([seen, dark]), motion)
+        assumed = blind_spots.obstacles(body, pose.yaw, sectors, unknown, HOUSING_M, past)
+        free = _free(body, np.concatenate([seen, assumed]), motion)
         at = scan.basis, pose
         return replace(now, by_scan=free, sectors=sectors, sectors_at=at, past=past)
 
-    def _moved(self, body: BodyDescription, tick: int, pose: Pose, measured: Velocity) -> float:
+    def _distance_since(
+        self, body: BodyDescription, tick: int, pose: Pose, measured: Velocity
+    ) -> float:
         """Return how far the body may have moved since the scan of the sectors [m].
 
-        The speed now says nothing about a gap in which the body braked; the odometry may jump, but
-        no farther than the body can drive counts.
+        The present speed is too low after braking, so the odometry counts as well. It may jump, so
+        it counts only up to the distance that the body can drive.
         """
         if self.sectors_at is None:
             return 0.0
-        since, there = self.sectors_at
-        elapsed_s = max(0, tick - since) * TICK_NS / 1e9
-        farthest = elapsed_s * math.hypot(body.max_linear_speed, body.max_lateral_speed)
-        driven = math.hypot(pose.x - there.x, pose.y - there.y)
+        tick_before, before = self.sectors_at
+        elapsed_s = max(0, tick - tick_before) * TICK_NS / 1e9
+        max_m = elapsed_s * math.hypot(body.max_linear_speed, body.max_lateral_speed)
+        driven = math.hypot(pose.x - before.x, pose.y - before.y)
         by_speed = elapsed_s * math.hypot(measured.linear_x, measured.linear_y)
-        return max(by_speed, min(driven, farthest))
+        return max(by_speed, min(driven, max_m))
 
-    def _closed(
+    def _with_zones(
         self, body: BodyDescription, state: RobotState, motion: Motion
     ) -> "ProtectiveField":
-        """Return the field with the nearest of scan and cameras, and the directions it closes."""
+        """Return the field with the obstacles of scan and cameras, and the stopped directions."""
         free, nearer = self.by_scan, set[str]()
         points = self.cameras.obstacles(state.pose)
         if len(points):
@@ -150,7 +152,7 @@ class ProtectiveField(Struct, frozen=True, kw_only=True):
         return replace(self, free=free, by_camera=frozenset(nearer), stopped=stopped)
 
     def caps(self, body: BodyDescription) -> SpeedCaps:
-        """Return the largest speed in each direction."""
+        """Return the speed cap of each direction."""
         allowed = {
             direction: brake.cap(self.free.get(direction), direction in self.stopped)
             for direction, brake in brakes(body).items()
@@ -172,7 +174,7 @@ class ProtectiveField(Struct, frozen=True, kw_only=True):
 
 
 def _shorter(one: float | None, other: float | None) -> bool:
-    """Return whether `one` leaves less free than `other`; None is all free."""
+    """Return whether the free distance `one` is shorter; None means no obstacle."""
     return one is not None and (other is None or one < other)
 
 
@@ -201,17 +203,17 @@ def _free(body: BodyDescription, points: Floats, motion: Motion) -> Free:
         for direction, along in ways:
             known = free[direction]
             if along >= MIN_ARC_LINEAR:
-                part = way * along / speed + _margin_on_curve(body, twist)
+                part = way * along / speed + _unneeded_margin(body, twist)
                 free[direction] = part if known is None else min(part, known)
     return free
 
 
-def _margin_on_curve(body: BodyDescription, twist: Axes) -> float:
-    """Return by how much less than straight on may be free along a curve [m].
+def _unneeded_margin(body: BodyDescription, twist: Axes) -> float:
+    """Return the part of the stop margin that a curve does not need [m].
 
-    The stop margin is room for the part of the body that moves farthest: on a curve, a corner. The
-    tighter the curve, the less of that way the body's middle goes, and none in a turn on the spot.
-    If the turn takes longer to brake than the speed, the way in that time counts as well.
+    The stop margin is room for the point of the body that moves farthest: on a curve, a corner. The
+    tighter the curve, the less the body's middle moves; in a turn on the spot, not at all. If the
+    turn takes longer to brake than the speed, the motion in the extra time is subtracted.
     """
     vx, vy, w = twist
     speed = math.hypot(vx, vy)
@@ -223,7 +225,7 @@ def _margin_on_curve(body: BodyDescription, twist: Axes) -> float:
 
 
 def _arc(body: BodyDescription, points: Floats, twist: Axes) -> float | None:
-    """Return the free distance along a curve or a slant [m]; None without one or an obstacle."""
+    """Return the free distance on a curve or diagonal [m]; None if straight or unobstructed."""
     ahead, aside = (abs(speed) >= MIN_ARC_LINEAR for speed in twist[:2])
     bends = abs(twist[2]) >= MIN_ARC_ANGULAR
     if not (ahead and aside) and not (bends and (ahead or aside)):
