@@ -1,4 +1,4 @@
-"""The kinematics of an arm, from its MJCF model: where its tool is, and how joints move it."""
+"""Kinematics of an arm from its MJCF model: pose of the tool, Jacobian, and gravity efforts."""
 
 import functools
 import math
@@ -16,9 +16,9 @@ from gigabrain_zenoh.manipulation.descent import Chain
 
 BASE = "base"  # the body in whose frame all poses are
 PADS = "pad_fixed", "pad_moving"  # geoms that touch what is held
-NEAR_M, NEAR_POSTURES = 0.001, 3000  # see `neighbours`
+NEAR_M, NEAR_POSTURES = 0.001, 3000  # to find bodies that can collide; see `neighbours`
 GRIPPER_STEPS = 41  # postures of the gripper at which its opening is measured
-# whatever reads files, or makes a small text a large model
+# elements that read files, or that make a large model of a short text
 FORBIDDEN = re.compile(
     r"<(include|mesh|hfield|skin|flex|flexcomp|composite|replicate|attach|model|plugin|extension)\b"
     r"|\bfile\s*="
@@ -46,11 +46,11 @@ class Frame:
 
 @dataclass(frozen=True, kw_only=True)
 class Follower:
-    """A joint that is tied to another by an equality of the model: a second finger, usually."""
+    """A joint that an equality of the model couples to another one, such as a second finger."""
 
     joint: str
     follows: str
-    polynomial: tuple[float, ...]  # of the other's distance from its place in the model
+    polynomial: tuple[float, ...]  # coefficients; argument: the other joint's offset from `qpos0`
 
 
 class ArmKinematics:
@@ -64,7 +64,7 @@ class ArmKinematics:
         """Read a model.
 
         Raises:
-            ConfigError: It is no MJCF model of primitives alone, or lacks a joint or the tool.
+            ConfigError: It is not an MJCF model of primitives, or lacks a joint or the tool.
         """
         self.tool = tool
         self.joints = tuple(one for one in joints if one.part == "arm")
@@ -86,7 +86,7 @@ class ArmKinematics:
         self.chain = self._chain()
 
     def spec(self) -> mujoco.MjSpec:
-        """Return a copy of the model, without what does not move with the arm's joints."""
+        """Return a copy of the model, in which only the given joints and their followers move."""
         return self._spec.copy()
 
     def forward(self, posture: Floats) -> Frame:
@@ -101,17 +101,17 @@ class ArmKinematics:
     def jacobian(self, posture: Floats) -> tuple[Frame, Floats]:
         """Return the pose of the tool, and its Jacobian (6, n).
 
-        Rows of the Jacobian: velocity [m/s] along x, y and z, then angular velocity [rad/s] about
-        them, for each joint's speed.
+        Its rows are the velocity [m/s] along x, y and z, then the angular velocity [rad/s] about
+        them, per unit of each joint's speed.
         """
         frame = self.forward(posture)
         mujoco.mj_comPos(self._model, self._data)
-        moved, turned = self._jacobian
-        mujoco.mj_jacSite(self._model, self._data, moved, turned, self._site)
+        linear, angular = self._jacobian
+        mujoco.mj_jacSite(self._model, self._data, linear, angular, self._site)
         return frame, self._jacobian.reshape(6, -1)[:, self._dofs]
 
     def weights(self, posture: Floats) -> Floats:
-        """Return the efforts that hold the arm against gravity (n,) [N m] or [N]."""
+        """Return the joints' efforts that hold the arm against gravity (n,) [N m] or [N]."""
         self._set(self._data, posture)
         mujoco.mj_kinematics(self._model, self._data)
         mujoco.mj_comPos(self._model, self._data)
@@ -120,9 +120,9 @@ class ArmKinematics:
         return np.asarray(efforts[self._dofs])
 
     def levers(self, beyond: float) -> Floats:
-        """Return how far what a joint moves is from it at most (n,) [m]; 1 where it slides.
+        """Return the largest distance of moved parts from each joint (n,) [m]; 1 if it slides.
 
-        What sticks out farther than the tool does so by `beyond` [m].
+        Parts may stick out `beyond` [m] farther than the tool.
         """
         links = np.linalg.norm([*self.chain.fixed[1:, :, 3], self.chain.tool[:, 3]], axis=1)
         reach = np.cumsum(links[::-1])[::-1] + beyond
@@ -136,14 +136,17 @@ class ArmKinematics:
 
     @functools.cached_property
     def neighbours(self) -> list[tuple[str, str]]:
-        """The pairs of bodies whose distance says nothing.
+        """The pairs of bodies whose distance is ignored.
 
-        Of one the other is joined to it, and one is fixed: MuJoCo itself leaves out only neighbours
-        of which both can move. Or two joints are between them, and they come near each other in
-        none of many postures, as a jaw and a wrist.
+        Either they are joined and one is fixed: MuJoCo leaves out such a pair only if both move.
+        Or two joints are between them, like a jaw and a wrist, and they are far from each other
+        in all of many random postures.
         """
         model = self._model
-        roots, parents = model.body_weldid, model.body_parentid  # a root is of a rigid part
+        roots, parents = (
+            model.body_weldid,
+            model.body_parentid,
+        )  # a root is a rigid part's first body
         above = [int(roots[parents[roots[body]]]) for body in range(model.nbody)]
         near, found = self._near(), []
         for one in range(1, model.nbody):
@@ -155,7 +158,7 @@ class ArmKinematics:
         return found
 
     def _near(self) -> set[tuple[int, int]]:
-        """Return pairs of bodies (the lower number first) that can come near each other."""
+        """Return the pairs of bodies (lower number first) that can come near each other."""
         spec = self.spec()
         for geom in spec.geoms:
             geom.contype = geom.conaffinity = int(bool(geom.contype or geom.conaffinity))
@@ -176,7 +179,7 @@ class ArmKinematics:
         return found
 
     def show(self, joint: int, position: float) -> str:
-        """Return the position of the arm's joint with this number as text, with its unit."""
+        """Return a position of the arm's joint with this number as text, with its unit."""
         slides = self.slides[joint]
         return f"{position * 1000:.0f} mm" if slides else f"{math.degrees(position):.0f}°"
 
@@ -191,7 +194,7 @@ class ArmKinematics:
         return tuple(self._spec.geom(pad).parent.name for pad in self._pads())
 
     def opening(self) -> "Opening":
-        """Return how far the gripper opens. Raises ConfigError for a model without pads."""
+        """Measure how far the gripper opens. Raises ConfigError for a model without pads."""
         if not self.gripper:
             raise ConfigError("this arm has no gripper")
         pads = self._pads()
@@ -200,7 +203,7 @@ class ArmKinematics:
         return Opening(positions=positions, low=faces[:, 0], high=faces[:, 1])
 
     def _chain(self) -> Chain:
-        """Return the joints and what lies between them, from the model at its rest."""
+        """Return the joints and the links between them, from the model at posture 0."""
         data = self._data
         self._set(data, np.zeros(len(self.joints)))
         mujoco.mj_kinematics(self._model, data)
@@ -220,7 +223,7 @@ class ArmKinematics:
         return Chain(fixed=steps[:-1].copy(), axes=axes, slides=self.slides, tool=steps[-1].copy())
 
     def _pads(self) -> list[str]:
-        """Return the names of the pads, perhaps with a prefix. Raises ConfigError."""
+        """Return the names of the pads in the model, with any prefix. Raises ConfigError."""
         known = [geom.name for geom in self._spec.geoms if geom.name]
         found = []
         for pad in PADS:
@@ -231,7 +234,7 @@ class ArmKinematics:
         return found
 
     def _faces(self, gripper: float, pads: Sequence[str]) -> tuple[float, float]:
-        """Return where the faces of the pads are along the tool's z axis [m]."""
+        """Return the positions of the pads' inner faces along the tool's z axis [m]."""
         self._set(self._data, (self.lower + self.upper) / 2, gripper)
         mujoco.mj_kinematics(self._model, self._data)
         axis = self._data.site_xmat[self._site].reshape(3, 3)[:, 2]
@@ -247,7 +250,7 @@ class ArmKinematics:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Opening:
-    """The faces of the gripper's pads along the tool's z axis, at some positions of its joint."""
+    """Positions of the pads' inner faces along the tool's z axis, for positions of the gripper."""
 
     positions: Floats  # (k,) [rad] or [m] of the gripper's joint, rising
     low: Floats  # (k,) [m] from the tool's origin
@@ -259,16 +262,16 @@ class Opening:
         return float((self.high - self.low).max())
 
     def position(self, width: float) -> float:
-        """Return the gripper's position at which the pads are `width` [m] apart, or nearly so."""
+        """Return the gripper's position [rad] or [m] for pads about `width` [m] apart."""
         widths = self.high - self.low
-        end = int(widths.argmax())  # a jaw that swings wide may come nearer again
+        end = int(widths.argmax())  # beyond it, a jaw that swings may close again
         begin = int(widths.argmin())
         part = slice(min(begin, end), max(begin, end) + 1)
         order = np.argsort(widths[part])
         return float(np.interp(width, widths[part][order], self.positions[part][order]))
 
     def middle(self, position: float) -> float:
-        """Return where the middle between the pads is along the tool's z axis [m]."""
+        """Return the position of the middle between the pads along the tool's z axis [m]."""
         both = (self.low + self.high) / 2
         return float(np.interp(position, self.positions, both))
 
@@ -288,7 +291,7 @@ class PostureSetter:
         self._rest = model.qpos0
 
     def __call__(self, data: mujoco.MjData, posture: Floats, gripper: float | None = None) -> None:
-        """Set the joints of the arm, and where it is given, the gripper's."""
+        """Set the joints of the arm, its followers, and the gripper's joint if given."""
         data.qpos[self._arm] = posture
         if gripper is not None and self._gripper is not None:
             data.qpos[self._gripper] = gripper
@@ -301,7 +304,7 @@ class PostureSetter:
 def _read(
     mjcf: str, joints: Sequence[str], tool: str
 ) -> tuple[mujoco.MjSpec, tuple[Follower, ...]]:
-    """Return the model with the given joints alone, its base at the origin, and followers."""
+    """Return the model with only the given joints, its base at the origin, and followers."""
     if len(mjcf) > MAX_MODEL_CHARACTERS:
         raise ConfigError(
             f"the arm's model has {len(mjcf)} characters; at most {MAX_MODEL_CHARACTERS} are read"
@@ -340,7 +343,7 @@ def _followers(spec: mujoco.MjSpec, joints: Sequence[str]) -> tuple[Follower, ..
 
 
 def _keep(spec: mujoco.MjSpec, joints: Sequence[str], followers: Sequence[Follower]) -> None:
-    """Delete all that is not needed, and joints that stay: a base's wheels are part of it."""
+    """Delete unneeded elements, and all other joints: a base's wheels become rigid parts."""
     kept = {*joints, *(one.joint for one in followers)}
     for kind in (spec.keys, spec.equalities, spec.actuators, spec.sensors, spec.tendons):
         for one in list(kind):

@@ -1,4 +1,4 @@
-"""Tells which points of a picture lie on an arm itself, or in its hand."""
+"""Finds the points of a depth image that lie on the robot's own arm, or in its hand."""
 
 from collections.abc import Mapping
 
@@ -10,12 +10,12 @@ from gigabrain_schemas.arrays import Floats
 from gigabrain_schemas.body import BodyDescription
 from gigabrain_zenoh.manipulation.arm_kinematics import ArmKinematics, PostureSetter
 
-MARGIN_M = 0.015  # round each part: a camera's mounting and a servo's play are not known better
-HAND_M = 0.06  # round the tool: what it holds, or is about to
+MARGIN_M = 0.015  # round each part, for errors of a camera's mounting and a servo's play
+HAND_M = 0.06  # radius round the tool, for an object that it holds or is about to grasp
 
 
 class ArmMask:
-    """The shapes of an arm, put where its joints are. Not for two threads at once."""
+    """The shapes of an arm, placed by its joints' positions. Not for two threads at once."""
 
     def __init__(self, mjcf: str, body: BodyDescription) -> None:
         """Read a model. Raises ConfigError for one that cannot be used."""
@@ -29,14 +29,14 @@ class ArmMask:
         self._tool = self._model.site(arm.tool).id
 
     def knows(self, joints: Mapping[str, float]) -> bool:
-        """Return whether the positions of all joints are there."""
+        """Return whether the positions of all of the arm's joints are given."""
         return joints.keys() >= set(self._names)
 
     def covers(self, points: Floats, joints: Mapping[str, float]) -> NDArray[np.bool_]:
         """Return which points (n, 3) [m] are on the arm or in its hand.
 
-        They are in the body's frame, z from the floor. The positions [rad] or [m] of all joints
-        have to be there.
+        Points are in the body's frame, with z from the floor. `joints` must have the positions
+        [rad] or [m] of all of the arm's joints.
         """
         gripper = joints.get(self._gripper.name) if self._gripper else None
         self._set(self._data, np.array([joints[name] for name in self._names]), gripper)

@@ -1,4 +1,4 @@
-"""Plans what an arm is asked to do: reach, take a posture, move its gripper, pick and place."""
+"""Plans the actions of an arm: reach, take a posture, move its gripper, pick, place, press."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -30,20 +30,21 @@ from gigabrain_zenoh.manipulation.planner import NoPath, plan
 from gigabrain_zenoh.manipulation.press import PressPlanner
 
 TABLE, ABOVE_TABLE = "the table", "just above the table"
-SPARE_M = 0.004  # from boxes beyond safety's clearance: it holds an arm that comes to that
-SUNK_M = 0.001  # of the floor below its place, as things stand on it
-SHARES = (0.57, 0.62, 0.7, 0.5, 0.78)  # of its reach, at which a thing is best grasped
-NEARER_M = 0.065  # farther than there, it goes nearer before it grasps: it stops 5 cm off at most
-BEFORE_M = 0.08  # between the body and a thing that it picks up
-MARGIN_M = 0.002  # from all that is around, of an arm that holds nothing
-ORIENTATION_RAD = math.radians(2)  # by which the approach of a tool that reaches may be off
-OFFERS = ((0.7, 0.5), (0.6, 0.55), (0.6, 0.4), (0.5, 0.5), (0.5, 0.3))  # ahead and up, of its reach
+SPARE_M = 0.004  # distance from boxes, beyond the clearance at which safety stops an arm
+SUNK_M = 0.001  # the floor is modelled lower, so that things on it do not touch it
+STAND_OFFS = (0.57, 0.62, 0.7, 0.5, 0.78)  # good distances for a grasp, as shares of the reach
+MAX_EXCESS_M = 0.065  # over the stand-off: beyond it, the body drives nearer (within 5 cm)
+MIN_GAP_M = 0.08  # between the body and a thing to pick up
+MARGIN_M = 0.002  # of an arm that holds nothing, from everything around
+ORIENTATION_RAD = math.radians(2)  # largest error of the approach, to reach a point
+# ahead and up, as shares of the reach
+OFFERS = ((0.7, 0.5), (0.6, 0.55), (0.6, 0.4), (0.5, 0.5), (0.5, 0.3))
 OFFER_PITCHES = (0.0, math.radians(30), None)
 PRESS_PITCHES = tuple(math.radians(angle) for angle in (90, 70, 50, 30, 0))
-# how far a gripper stays short of where it was sent, as shares of its range
-HELD = 0.01  # from here on something is between the fingers
-MOVING = (0.0315, 0.035, 0.049)  # while the arm moves what it holds: least, set, and most
-STILL = (0.018, 0.02, 0.0224)  # while it is still: servos hold on for hours and stay below 60 °C
+# lag of a gripper behind its goal, as shares of its range
+HELD = 0.01  # with a larger lag, something is between the fingers
+MOVING = (0.0315, 0.035, 0.049)  # least, set and largest, while the arm moves
+STILL = (0.018, 0.02, 0.0224)  # the same at rest, where servos stay below 60 °C for hours
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -51,19 +52,19 @@ class Hold:
     """A thing in the gripper."""
 
     thing: Thing  # in the frame of the tool
-    grip: float  # [rad] or [m], where the gripper's joint was sent
-    opening: float  # [rad] or [m], where it goes to let go
+    grip: float  # [rad] or [m], goal of the gripper's joint
+    opening: float  # [rad] or [m], its goal to let go
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Plan:
-    """Phases; of a pick also what the gripper holds once it has closed."""
+    """Phases of an action; for a pick, also the thing in the closed gripper."""
 
     phases: tuple[Phase, ...]
     hold: Hold | None = None
     grasp: Grasp | None = None
-    grasps: tuple[Grasp, ...] = ()  # all that were found, the chosen one first
-    before: Floats | None = None  # (n,) of a press: the posture to which it goes back
+    grasps: tuple[Grasp, ...] = ()  # all possible ones, the chosen one first
+    before: Floats | None = None  # (n,) of a press: the posture for the return
 
 
 class ArmPlanner:
@@ -98,18 +99,18 @@ class ArmPlanner:
         hold: Hold | None,
         gripper_at: float | None = None,
     ) -> Plan | NoWay:
-        """Return how to bring the tool to a point (3,) [m] in the frame of the arm's base.
+        """Plan to bring the tool to a point.
 
         Args:
-            point: Where the tool should be.
-            pitch: How far the tool points down [rad], 0 for level; None for any way.
-            things: What is around.
-            posture: Where the arm is (n,).
-            hold: What it holds.
-            gripper_at: Where an empty gripper is [rad] or [m]; otherwise as in the model.
+            point: Goal of the tool (3,) [m], in the frame of the arm's base.
+            pitch: Angle of the tool below level [rad]; None for any direction.
+            things: Things around.
+            posture: Present posture (n,).
+            hold: The held thing.
+            gripper_at: Position of an empty gripper [rad] or [m]; otherwise as in the model.
         """
         goal = self.tool_goal(point, pitch)
-        if self._above_floor and hold is None:  # first a way that safety does not hold up there
+        if self._above_floor and hold is None:  # prefer a way on which safety does not slow it
             higher = self._checker([*things, *self._above_floor], None, gripper_at)
             way = self._way_to(higher, goal, posture)
             if isinstance(way, Plan):
@@ -138,9 +139,9 @@ class ArmPlanner:
         hold: Hold | None,
         gripper_at: float | None = None,
     ) -> Plan | NoWay:
-        """Return how to move joints to `positions` [rad] or [m], and the gripper at the end.
+        """Plan to move joints to `positions` [rad] or [m], and the gripper at the end.
 
-        Until then an empty gripper is at `gripper_at` [rad] or [m]; None: as in the model.
+        Until then, an empty gripper is at `gripper_at` [rad] or [m]; None: as in the model.
         """
         wanted = zip(self.arm.names, posture, strict=True)
         goal = np.array([positions.get(name, here) for name, here in wanted])
@@ -151,7 +152,7 @@ class ArmPlanner:
         return Plan(phases=(*moved.phases, Phase(name="grip", gripper=positions[gripper.name])))
 
     def grip(self, to: float | Literal["open", "close"]) -> Plan:
-        """Return how to move the gripper. Raises ConfigError for an arm without one."""
+        """Plan a move of the gripper [rad] or [m]. Raises ConfigError for an arm without one."""
         gripper = self.arm.gripper
         if gripper is None:
             raise ConfigError("this arm has no gripper")
@@ -169,14 +170,14 @@ class ArmPlanner:
         *,
         drives: bool = False,
     ) -> Plan | NoWay:
-        """Return how to pick a thing up; `without` as in `PickPlacePlanner.pick`.
+        """Plan to pick a thing up; `without` as in `PickPlacePlanner.pick`.
 
-        For a body that `drives`, the refusal says how far from the thing it should stand.
+        For a body that `drives`, a refusal has the distance at which picking succeeds.
         """
         far = math.hypot(*thing.position[:2])
-        goes = drives and (not without or far > self._reach)
-        stand_off = self._stand_off(thing, posture) if goes else None
-        if stand_off is not None and far > stand_off + NEARER_M:
+        may_drive = drives and (not without or far > self._reach)
+        stand_off = self._stand_off(thing, posture) if may_drive else None
+        if stand_off is not None and far > stand_off + MAX_EXCESS_M:
             return NoWay(reason=f"{thing.name}: too far", stand_off=stand_off)
         found = self._picker().pick(thing, self._all(things), posture, without)
         if isinstance(found, NoWay):
@@ -192,7 +193,7 @@ class ArmPlanner:
     def place(
         self, hold: Hold, target: Floats, things: Sequence[Thing], posture: Floats
     ) -> Plan | NoWay:
-        """Return how to put down what is held, its middle at `target` (3,) [m]."""
+        """Plan to put down the held thing, with its middle at `target` (3,) [m]."""
         around = self._all(things)
         found = self._picker().place(hold.thing, target, around, posture, hold.opening)
         return found if isinstance(found, NoWay) else Plan(phases=found.phases)
@@ -205,14 +206,14 @@ class ArmPlanner:
         things: Sequence[Thing],
         posture: Floats,
     ) -> Plan | NoWay:
-        """Return how to press a place (3,) [m], or the near side of a thing.
+        """Plan to press a place (3,) [m], or the near side of a thing.
 
         Args:
             target: The place, or the thing.
-            pitch: How far the tool points down [rad], 0 for level; None for any way.
-            depth: How far it goes on behind the place at most [m].
-            things: What else is around.
-            posture: Where the arm is (n,).
+            pitch: Angle of the tool below level [rad]; None for any direction.
+            depth: Largest motion beyond the place [m].
+            things: Other things around.
+            posture: Present posture (n,).
         """
         pitches = PRESS_PITCHES if pitch is None else (pitch,)
         middle = target.position if isinstance(target, Thing) else target
@@ -223,7 +224,7 @@ class ArmPlanner:
         return Plan(phases=found.phases, before=found.before)
 
     def after_press(self, pressed: Plan, posture: Floats, seconds: float) -> Plan:
-        """Return how to hold what is pressed for some seconds, and to go back."""
+        """Plan to keep the posture of a press for some `seconds`, and then to go back."""
         assert pressed.before is not None
         phases = self._presser().back(posture, pressed.before, seconds)
         return replace(pressed, phases=phases)
@@ -236,7 +237,7 @@ class ArmPlanner:
         posture: Floats,
         hold: Hold,
     ) -> Plan | NoWay:
-        """Return how to bring what is held to a point (3,) [m]; None: well ahead, and high."""
+        """Plan to bring the held thing to a point (3,) [m]; None for a point ahead and high."""
         if at is not None:
             return self.reach(at, pitch, things, posture, hold)
         pitches = OFFER_PITCHES if pitch is None else (pitch,)
@@ -250,38 +251,38 @@ class ArmPlanner:
         return fault
 
     def back_off(self, left: Plan, posture: Floats) -> Plan:
-        """Return the way from a thing that is not held, or from what was pressed."""
+        """Plan the retreat from a thing that is not held, or from a press."""
         if left.grasp is None:
             return self.after_press(left, posture, 0.0)
         return Plan(phases=self._picker().back_off(left.grasp, posture), grasp=left.grasp)
 
     def squeeze(self, measured: float, wanted: float, *, moving: bool) -> float:
-        """Return where the gripper goes to squeeze what it holds as hard as it should.
+        """Return the gripper's goal [rad] or [m] for the right force on the held thing.
 
-        A gripper whose greatest effort is not known stays.
+        The goal stays if the gripper's largest effort is unknown.
 
         Args:
-            measured: Where it is [rad] or [m].
-            wanted: Where it was sent [rad] or [m].
-            moving: Whether the arm moves meanwhile.
+            measured: Position of its joint [rad] or [m].
+            wanted: Newest goal of its joint [rad] or [m].
+            moving: Whether the arm moves at the same time.
         """
         gripper = self.arm.gripper
         assert gripper
         span, lag = gripper.upper - gripper.lower, wanted - measured
-        least, aim, most = (share * span for share in (MOVING if moving else STILL))
-        if not gripper.max_effort or least <= abs(lag) <= most:
+        least, aim, largest = (share * span for share in (MOVING if moving else STILL))
+        if not gripper.max_effort or least <= abs(lag) <= largest:
             return wanted
         return max(gripper.lower, min(gripper.upper, measured + math.copysign(aim, lag)))
 
     def gripped(self, hold: Hold, thing: Thing, measured: Floats) -> Hold:
-        """Return what is held by fingers that have just closed on a thing.
+        """Return the hold after the fingers have closed on a thing.
 
-        Along the axis in which they close it is between them; else where it stood.
+        Along the closing axis the thing is between the fingers; along the others it has not moved.
 
         Args:
-            hold: As it was planned.
-            thing: Where it stood.
-            measured: Where the arm is (n,).
+            hold: The planned hold.
+            thing: The thing before it was grasped, in the frame of the base.
+            measured: Measured posture (n,).
         """
         tool = self.arm.forward(measured)
         place = tool.axes.T @ (thing.position - tool.position)
@@ -291,18 +292,18 @@ class ArmPlanner:
         )
 
     def holds(self, measured: float, wanted: float) -> bool:
-        """Return whether the gripper has stopped short of where it was sent."""
+        """Return whether an object stopped the gripper before its goal, both [rad] or [m]."""
         gripper = self.arm.gripper
         assert gripper
         return abs(measured - wanted) > HELD * (gripper.upper - gripper.lower)
 
     def _stand_off(self, thing: Thing, posture: Floats) -> float | None:
-        """Return how far ahead of the base a thing is grasped well [m]; None for nowhere."""
-        least = self._front + float(thing.half[:2].max()) + BEFORE_M
-        for far in (share * self._reach for share in SHARES):
+        """Return a good distance for a grasp ahead of the base [m]; None if there is none."""
+        least = self._front + float(thing.half[:2].max()) + MIN_GAP_M
+        for far in (share * self._reach for share in STAND_OFFS):
             place = np.array([far, 0.0, thing.position[2]])
-            there = replace(thing, position=place, axes=turned(0.0))
-            if far >= least and self._picker().can_grasp(there, self._around, posture):
+            moved = replace(thing, position=place, axes=turned(0.0))
+            if far >= least and self._picker().can_grasp(moved, self._around, posture):
                 return far
         return None
 
@@ -340,7 +341,7 @@ class ArmPlanner:
         return Plan(phases=(Phase(name="move", arm=trajectory),))
 
     def _approach(self, point: Floats, pitch: float) -> Floats:
-        """Return the direction of a tool that comes from above the first joint's axis."""
+        """Return the tool's direction (3,) towards a point, away from the first joint's axis."""
         away = point[:2] - self.arm.chain.fixed[0, :2, 3]
         azimuth = math.atan2(away[1], away[0])
         level = math.cos(pitch)
@@ -350,22 +351,22 @@ class ArmPlanner:
         if found.posture is None:
             return found.reason
         text = f"not reachable: {found.reason}"
-        if found.cause in ("collision", "orientation"):  # the tool can be at the point itself
+        if found.cause in ("collision", "orientation"):  # the position itself is reachable
             return text
         x, y, z = self.arm.forward(found.posture).position
         return f"{text}; the nearest is ({x:.3f}, {y:.3f}, {z:.3f})"
 
 
 def surroundings(body: BodyDescription) -> list[Thing]:
-    """Return the floor, and the boxes that no part of an arm may enter with what safety keeps."""
+    """Return the floor, and the keep-out boxes, grown by the clearance that safety keeps."""
     assert body.arm
     found = []
     if body.arm.floor is not None:
         place = np.array([0.0, 0.0, body.arm.floor - SUNK_M])
         found.append(Thing(name=TABLE, kind="floor", position=place))
-    kept = 2 * (body.thresholds.arm_clearance + SPARE_M)
+    growth = 2 * (body.thresholds.arm_clearance + SPARE_M)
     for box in body.arm.keep_out:
-        length, width, height = (side + kept for side in box.size)
+        length, width, height = (side + growth for side in box.size)
         found.append(Thing(
             name=box.name, kind="box", size=(length, width, height),
             position=np.array(box.center), axes=turned(box.yaw),

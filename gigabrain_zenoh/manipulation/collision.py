@@ -1,4 +1,4 @@
-"""Tells what an arm touches in a posture: itself, its base, a floor, things, what it holds."""
+"""Finds collisions of an arm in a posture: with itself, its base, a floor, things, or its load."""
 
 import math
 from collections.abc import Collection, Sequence
@@ -20,9 +20,9 @@ from gigabrain_zenoh.manipulation.arm_kinematics import (
 MARGIN_M = 0.005
 DISTANCE_CUTOFF_M = 0.1
 CLEARANCE_CUTOFF_M = 0.012
-MIN_SWEEP_M = 0.001  # of a line of postures, by which the margin may be undercut
-LINK_RADIUS_M = 0.03  # by which links and tools stick out, beyond the line from joint to joint
-HELD = "held"  # the body of what the tool holds
+MIN_SWEEP_M = 0.001  # shorter parts of a line are not divided; the margin may be short by this
+LINK_RADIUS_M = 0.03  # of links and tools, round the line from joint to joint
+HELD = "held"  # name of the held thing's body
 SIZES = {"box": 3, "cylinder": 2, "sphere": 1, "floor": 0}
 BASE_FRAME = Frame(position=np.zeros(3), axes=np.eye(3))
 MIN_SIZE_M, MAX_SIZE_M = 1e-4, 100.0
@@ -36,10 +36,10 @@ GEOMS = {
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Thing:
-    """A solid: something in the way, a keep-out box, a floor, or what is to be held.
+    """A solid: an obstacle, a keep-out box, a floor, or an object to pick up.
 
-    Sizes [m]: of a box its lengths along x, y and z; of a cylinder its radius and its length along
-    z; of a sphere its radius. A floor is all that is below its place along z.
+    Sizes [m] are: for a box its lengths along x, y and z; for a cylinder its radius and its length
+    along z; for a sphere its radius. A floor is the half-space below its position along z.
     """
 
     name: str
@@ -67,24 +67,24 @@ class Thing:
 
 
 def turned(yaw: float) -> Floats:
-    """Return axes (3, 3) that are turned by `yaw` [rad] about z."""
+    """Return the axes (3, 3) of a frame that is turned by `yaw` [rad] about z."""
     cos, sin = math.cos(yaw), math.sin(yaw)
     return np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
 
 
 @dataclass(frozen=True, kw_only=True)
 class Clearance:
-    """The smallest distance of an arm's parts from all that they should not touch."""
+    """The smallest distance of an arm's parts from the solids that they must not touch."""
 
     distance: float  # [m], below 0 where they overlap; the cutoff if nothing is nearer
-    pair: tuple[str, str] | None = None  # names of the two; None beyond the cutoff
+    pair: tuple[str, str] | None = None  # names of the nearest two; None beyond the cutoff
 
 
 class CollisionChecker:
-    """An arm among things, perhaps with something held. Not for two threads at once.
+    """An arm among things, perhaps with a held one. Not for two threads at once.
 
-    Links that are joined to each other do not count, nor do parts of the hand against what it
-    holds. Things stay where they are: make another checker when they have moved.
+    Contacts between joined links do not count, nor those between the hand and the held thing.
+    Things are fixed: make another checker when they have moved.
     """
 
     def __init__(
@@ -97,13 +97,13 @@ class CollisionChecker:
         ignore: Sequence[tuple[str, str]] = (),
         gripper: float | None = None,
     ) -> None:
-        """Build a model of all.
+        """Build the model.
 
         Args:
             arm: The arm.
-            things: What is in the way, in the frame of the arm's base.
+            things: Obstacles, in the frame of the arm's base.
             held: A thing in the frame of the tool, fixed to it.
-            margin: What is nearer [m] counts as touching.
+            margin: Distance below which two solids count as touching [m].
             ignore: Names of things (or "held") and of bodies of the arm that may touch.
             gripper: Position of the gripper's joint [rad] or [m]; otherwise as in the model.
 
@@ -112,7 +112,7 @@ class CollisionChecker:
         """
         self.arm, self.margin, self.gripper = arm, margin, gripper
         spec = arm.spec()
-        for geom in spec.geoms:  # what can touch anything touches everything
+        for geom in spec.geoms:  # geoms with any contact bits collide with all others
             geom.contype = geom.conaffinity = int(bool(geom.contype or geom.conaffinity))
         for thing in things:
             _add(spec, spec.worldbody, thing, thing.name, BASE_FRAME)
@@ -127,7 +127,7 @@ class CollisionChecker:
         self._names = [_name(self._model, geom, added) for geom in range(self._model.ngeom)]
 
     def touches(self, posture: Floats) -> str:
-        """Return what touches what within the margin, as text; empty for nothing."""
+        """Return the names of two that touch within the margin, as text; empty if none do."""
         self._place(posture, self.margin)
         distance, pair = self._overlap() or self._nearest(self.margin)
         return " and ".join(pair) if pair and distance < self.margin else ""
@@ -137,9 +137,9 @@ class CollisionChecker:
         return not self.touches(posture)
 
     def room(self, posture: Floats, cutoff: float = CLEARANCE_CUTOFF_M) -> float:
-        """Return a distance [m] that all parts keep; their smallest one may be a bit larger.
+        """Return a lower bound of the clearance [m].
 
-        It is exact where it is no more than the margin.
+        It is exact up to the margin.
         """
         self._place(posture, cutoff)
         if not self._data.ncon:
@@ -148,14 +148,14 @@ class CollisionChecker:
         return self._nearest(self.margin)[0] if 0.0 < room <= self.margin else room
 
     def sweep(self, start: Floats, goal: Floats) -> float:
-        """Return how far any part of the arm moves at most on a straight line of postures [m]."""
+        """Return an upper bound of any part's motion along a straight line of postures [m]."""
         return float(np.abs(goal - start) @ self._levers)
 
     def is_line_free(self, start: Floats, goal: Floats, share: float = 1.0) -> bool:
         """Return whether nothing is within a share of the margin between two postures.
 
-        It is divided until each part is shorter than the room around its middle, so that nothing is
-        missed between two postures that are looked at.
+        The line is divided until each part is shorter than the room around its middle, so that no
+        contact is missed between two checked postures.
         """
         parts = [(0.0, 1.0)]
         whole = self.sweep(start, goal)
@@ -176,7 +176,7 @@ class CollisionChecker:
         return Clearance(distance=distance, pair=pair)
 
     def _overlap(self) -> tuple[float, tuple[str, str]] | None:
-        """Return the deepest contact of two that overlap."""
+        """Return the deepest overlap: its distance [m], below 0, and names; None without one."""
         contacts = self._data.contact
         if not self._data.ncon or contacts.dist.min() >= 0.0:
             return None
@@ -187,7 +187,7 @@ class CollisionChecker:
     def _nearest(self, cutoff: float) -> tuple[float, tuple[str, str] | None]:
         """Return the smallest distance [m] among contacts that may be nearer than `cutoff`.
 
-        Contacts of boxes that do not touch are said to be nearer than they are.
+        MuJoCo reports contacts of boxes that do not touch as nearer than they are.
         """
         contacts = self._data.contact
         nearest, found, ends = cutoff, None, np.zeros(6)
@@ -213,7 +213,7 @@ class CollisionChecker:
 def _add(
     spec: mujoco.MjSpec, parent: mujoco.MjsBody, thing: Thing, name: str, within: Frame
 ) -> None:
-    """Add a thing that lies in a frame of a body."""
+    """Add a thing to `parent`; its pose is in the frame `within` of that body."""
     if spec.body(name):
         raise ConfigError(f"two things, or a thing and a part of the arm, are called {name!r}")
     quaternion, size = np.empty(4), np.zeros(3)

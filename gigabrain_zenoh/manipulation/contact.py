@@ -1,7 +1,7 @@
-"""Feels what pushes an arm's tool: by the efforts of its joints, and by how far they lag behind.
+"""Estimates the push on an arm's tool from the joints' efforts and lag.
 
-Both are compared with what they were a moment before, so that gravity, friction and a steady speed
-do not count. Efforts are those with which joints hold the tool against the push: J^T F.
+Both are compared with their means of a moment before, so that gravity, friction and a steady speed
+do not count. The joints hold the tool against a force F with the efforts J^T F.
 """
 
 from dataclasses import dataclass
@@ -11,9 +11,9 @@ import numpy as np
 from gigabrain_schemas.arrays import Floats
 from gigabrain_zenoh.manipulation.arm_kinematics import ArmKinematics
 
-SKIPPED_TICKS = 10  # at first: friction and speed have to settle
-REFERENCE_TICKS = 10  # after them, with whose mean is compared
-MIN_SHARE = 0.1  # of the greatest lever; where levers are shorter, a force is not known
+SKIPPED_TICKS = 10  # until friction and speed have settled
+REFERENCE_TICKS = 10  # the next ones, whose mean is the reference
+MIN_SHARE = 0.1  # of the longest lever; forces on shorter levers are not estimated
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -25,7 +25,7 @@ class Push:
 
 
 class ContactSense:
-    """Compares an arm tick by tick with what it was in the first ones."""
+    """Compares an arm's efforts and lag in each tick with those of the first ticks."""
 
     def __init__(self, arm: ArmKinematics) -> None:
         self._arm = arm
@@ -33,12 +33,12 @@ class ContactSense:
         self._loads, self._lag = np.zeros(len(arm.joints)), np.zeros(3)
 
     def feel(self, measured: Floats, sent: Floats, efforts: Floats | None) -> Push | None:
-        """Return what pushes the tool since the first ticks; None during these.
+        """Return the change of the push since the first ticks; None during these.
 
         Args:
-            measured: Where the joints are (n,) [rad] or [m].
-            sent: Where they were sent.
-            efforts: With which they hold (n,) [N m] or [N].
+            measured: Positions of the joints (n,) [rad] or [m].
+            sent: Their goals (n,) [rad] or [m].
+            efforts: Their efforts (n,) [N m] or [N]; None if not measured.
         """
         ahead = self._arm.forward(sent).position
         here, jacobian = self._arm.jacobian(measured)

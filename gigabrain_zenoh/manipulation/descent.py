@@ -1,8 +1,8 @@
 """The inner loop of inverse kinematics: a chain of joints, and the descent to a goal, compiled.
 
-A chain is `fixed` (n, 3, 4), what lies before each joint: rotation and place [m] from the joint
-before; `axes` (n, 3) of the joints in their own frames; `slides` (n,), which of them slide; and
-`tool` (3, 4), from the last joint to the tool.
+A chain has: `fixed` (n, 3, 4), the rotation and position [m] of each joint in the frame of the
+joint before; `axes` (n, 3) of the joints in their own frames; `slides` (n,), true for joints that
+slide; and `tool` (3, 4), the pose of the tool in the frame of the last joint.
 """
 
 import math
@@ -15,18 +15,18 @@ from gigabrain_schemas.arrays import Floats
 from gigabrain_zenoh.kernels.jit import kernel
 
 Flags = NDArray[np.bool_]
-PLACE, APPROACH, AXES = 0, 1, 2  # which part of a goal counts
-MAX_STEP = 0.6  # [rad] or [m] of a joint
-MIN_STEP = 1e-6
-NO_STEP = 1e-5  # as small as this it is not tried any smaller
-SLOW_STEP, SLOW_GAIN = 1e-3, 1e-4  # steps that bring so little end the descent
-FINE_M, FINE_RAD = 1e-6, 1e-5  # errors at which a posture is improved no more
+PLACE, APPROACH, AXES = 0, 1, 2  # part of a goal that must be met
+MAX_STEP = 0.6  # [rad] or [m], of a joint
+MIN_STEP = 1e-6  # smaller steps end the descent
+NO_STEP = 1e-5  # a step smaller than this is not shortened further
+SLOW_STEP, SLOW_GAIN = 1e-3, 1e-4  # steps below both end the descent; gain: share of the cost
+FINE_M, FINE_RAD = 1e-6, 1e-5  # errors below which the descent ends
 DAMPING, MIN_DAMPING, MAX_DAMPING = 1e-4, 1e-9, 1e3
-EASE, STIFFEN = 0.2, 6.0  # factors of the damping after a step that helped, and one that did not
+EASE, STIFFEN = 0.2, 6.0  # factors of the damping after a successful and after a failed step
 
 
 class Chain(NamedTuple):
-    """The joints from the base to the tool; see above."""
+    """The joints from the base to the tool; see the module's docstring."""
 
     fixed: Floats
     axes: Floats
@@ -63,7 +63,7 @@ def _rotation(axis: Floats, angle: float, into: Floats) -> None:
 
 @kernel
 def tool_pose(chain: Chain, posture: Floats, frame: Floats, joints: Floats) -> None:
-    """Fill in the pose of the tool (3, 4), and place and direction of each joint (n, 2, 3)."""
+    """Fill in the pose of the tool (3, 4), and each joint's position and axis (n, 2, 3)."""
     turn = np.empty((3, 3))
     frame[:] = 0.0
     for row in range(3):
@@ -88,13 +88,13 @@ def tool_pose(chain: Chain, posture: Floats, frame: Floats, joints: Floats) -> N
 
 @kernel
 def _direction_error(frame: Floats, goal: Floats, error: Floats) -> None:
-    """Fill in the shortest turn [rad] that takes the x axis of `frame` to that of `goal`."""
+    """Fill in the smallest rotation [rad] from the x axis of `frame` to that of `goal`."""
     x, y, z = frame[0, 0], frame[1, 0], frame[2, 0]
     a, b, c = goal[0, 0], goal[1, 0], goal[2, 0]
     error[3], error[4], error[5] = y * c - z * b, z * a - x * c, x * b - y * a
     sine = math.sqrt(error[3] ** 2 + error[4] ** 2 + error[5] ** 2)
     cosine = x * a + y * b + z * c
-    if sine < 1e-9 and cosine < 0.0:  # opposite: about any axis across, as the frame's z axis
+    if sine < 1e-9 and cosine < 0.0:  # opposite: any perpendicular axis will do
         error[3:6] = math.pi * frame[:, 2]
     elif sine >= 1e-9:
         error[3:6] *= math.atan2(sine, cosine) / sine
@@ -102,9 +102,9 @@ def _direction_error(frame: Floats, goal: Floats, error: Floats) -> None:
 
 @kernel
 def _axes_error(frame: Floats, goal: Floats, error: Floats) -> None:
-    """Fill in the turn [rad] that takes all axes of `frame` to those of `goal`."""
+    """Fill in the rotation [rad] from all axes of `frame` to those of `goal`."""
     error[3:6] = 0.0
-    cosine = -1.0  # of the angle, twice
+    cosine = -1.0  # of the angle, times two, as is `sine`
     for k in range(3):
         x, y, z = frame[0, k], frame[1, k], frame[2, k]
         a, b, c = goal[0, k], goal[1, k], goal[2, k]
@@ -115,7 +115,7 @@ def _axes_error(frame: Floats, goal: Floats, error: Floats) -> None:
     sine = math.sqrt(error[3] ** 2 + error[4] ** 2 + error[5] ** 2)
     if sine >= 1e-9:
         error[3:6] *= math.atan2(sine, cosine) / sine
-    elif cosine < 0.0:  # half a turn, about the mean of an axis and where it should be
+    elif cosine < 0.0:  # half a turn, about the mean of an axis and its goal
         longest = 0.0
         for k in range(3):
             x, y, z = frame[0, k] + goal[0, k], frame[1, k] + goal[1, k], frame[2, k] + goal[2, k]
@@ -128,7 +128,7 @@ def _axes_error(frame: Floats, goal: Floats, error: Floats) -> None:
 
 @kernel
 def _goal_error(frame: Floats, goal: Floats, part: int, error: Floats) -> None:
-    """Fill in how far `frame` is off its `goal` (3, 4): (6,) [m], [rad]."""
+    """Fill in the error of `frame` from its `goal` (3, 4): (6,) [m], [rad]."""
     error[:] = 0.0
     for row in range(3):
         error[row] = goal[row, 3] - frame[row, 3]
@@ -142,9 +142,9 @@ def _goal_error(frame: Floats, goal: Floats, part: int, error: Floats) -> None:
 def _solved(
     square: Floats, right: Floats, damping: float, held: Flags, lower: Floats, step: Floats
 ) -> None:
-    """Fill in `step` of (square + damping) step = right; joints that are held stay (Cholesky).
+    """Solve (square + damping) step = right for `step` (Cholesky); joints that are held stay.
 
-    `lower` (n, n) is for its own use.
+    `lower` (n, n) is scratch space.
     """
     count = len(right)
     for i in range(count):
@@ -212,7 +212,7 @@ def _descend(
     chain: Chain, limits: Floats, goal: Floats, part: int, weight: float, steps: int,
     posture: Floats, held: Flags, error: Floats,
 ) -> None:  # fmt: skip
-    """Improve one posture (n,), by the steps of Levenberg and Marquardt."""
+    """Improve one posture (n,) by Levenberg-Marquardt steps."""
     count = len(posture)
     frame, joints = np.empty((3, 4)), np.empty((count, 2, 3))
     square, slope, step = np.empty((count, count)), np.empty(count), np.empty(count)
@@ -258,10 +258,10 @@ def descend(
     chain: Chain, limits: Floats, goal: Floats, part: int, weight: float, steps: int,
     postures: Floats, held: Flags, errors: Floats,
 ) -> None:  # fmt: skip
-    """Improve `postures` (k, n), each until its squared errors are least, or for so many steps.
+    """Minimise the squared errors of each of `postures` (k, n), in at most so many `steps`.
 
     A radian counts as `weight` [m]; `limits` are (2, n). Fills in `held` (k, n), the joints that
-    would go on, were they not at their limits, and the `errors` (k, 2) that are left [m], [rad].
+    their limits keep from moving on, and the remaining `errors` (k, 2) [m], [rad].
     """
     error = np.empty(6)
     for k in range(len(postures)):
@@ -271,7 +271,7 @@ def descend(
 
 
 def warm_up() -> None:
-    """Compile the kernels, by an arm of one joint."""
+    """Compile the kernels, with an arm of one joint."""
     frame = np.eye(3, 4)
     chain = Chain(
         fixed=frame[None].copy(), axes=np.eye(3)[2:], slides=np.zeros(1, np.bool_), tool=frame

@@ -1,9 +1,9 @@
-"""Ways to grasp a thing, from its pose and size: where the tool goes, how wide, at which tilt.
+"""Plans grasps of a thing from its pose and size: pose of the tool, width and tilt.
 
 The tool's x axis is the approach, and the fingers close along its z axis. Boxes are held at
 opposite faces, cylinders round their side, balls anywhere. The approach is from above, or tilted
-about the axis along which the fingers close, as far as lying flat: an arm with few joints may reach
-a thing only so.
+about the axis along which the fingers close, up to horizontal. An arm with few joints may reach a
+thing only with such a tilt.
 """
 
 import math
@@ -23,19 +23,20 @@ from gigabrain_zenoh.manipulation.inverse_kinematics import (
     ToolGoal,
 )
 
-GAP_M = 0.006  # at least, between each finger and the thing, before they close
-WIDE_GAP_M = 0.01  # where the gripper opens so far: a camera errs by 6 mm
-WIDE, ROOM_M = 0.6, 0.01  # of the widest opening; clearance beyond which more does not count
-MARGIN_M = 0.001  # of the open hand from all else
+GAP_M = 0.006  # least gap between each finger and the thing, before they close
+WIDE_GAP_M = 0.01  # the same if the gripper opens wide enough: a camera errs by 6 mm
+WIDE = 0.6  # share of the widest opening; for wider things the tilt decides beyond ROOM_M
+ROOM_M = 0.01  # sufficient clearance for a wide thing
+MARGIN_M = 0.001  # of the open hand from everything else
 TILTS_RAD = tuple(math.radians(angle) for angle in (0, 15, 30, 45, 60, 75, 90))
-YAWS = 12  # directions round what is round
-RETREATS_M = (0.08, 0.05, 0.03)  # from which it approaches, the farthest that is possible
-HEIGHTS = (0.0, 0.3, 0.6)  # of half the thing's height, above its middle
+YAWS = 12  # directions round a cylinder or a sphere
+RETREATS_M = (0.08, 0.05, 0.03)  # lengths of the approach; the first possible one is used
+HEIGHTS = (0.0, 0.3, 0.6)  # of the tool above the thing's middle, as shares of half its height
 TOLERANCE_RAD = math.radians(4)  # of the tool's orientation at the thing
-DRIFT_RAD = math.radians(35)  # the same where the approach begins
-TRIES = 5  # of inverse kinematics, for each
-ENOUGH_GRASPS = 8  # grasps
-MIN_LEVEL = 0.3  # sine between the vertical and the axis along which fingers close
+DRIFT_RAD = math.radians(35)  # the same at the start of the approach
+TRIES = 5  # start postures of inverse kinematics, per pose
+ENOUGH_GRASPS = 8  # the search stops after so many
+MIN_LEVEL = 0.3  # sine of the angle from the vertical to the axis along which fingers close
 UP = np.array([0.0, 0.0, 1.0])
 
 
@@ -44,13 +45,13 @@ class Grasp:
     """A way to grasp: postures before it and at it, between which the arm moves straight."""
 
     tool: Frame  # where the tool is when the fingers close
-    width: float  # [m] of the thing along which they close
+    width: float  # [m], of the thing between the fingers
     tilt: float  # [rad] of the approach; 0 from above
-    opening: float  # [rad] or [m] of the gripper's joint, before
-    closed: float  # the same at the thing; what it ends at when the thing is held
-    before: Floats  # (n,) posture from which it approaches
+    opening: float  # [rad] or [m], of the gripper's joint during the approach
+    closed: float  # [rad] or [m], the same when the fingers touch the thing
+    before: Floats  # (n,) posture at the start of the approach
     posture: Floats  # (n,) posture at the thing
-    clearance: float  # [m] of the arm from all else
+    clearance: float  # [m], of the arm from everything else
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -74,15 +75,16 @@ class GraspPlanner:
         start: Floats | None = None,
         enough: int = ENOUGH_GRASPS,
     ) -> list[Grasp] | NoGrasp:
-        """Return the ways to grasp a thing, those with the largest clearance first.
+        """Return grasps of a thing, those with the largest clearance first.
 
-        Of a wide thing the most upright come first that have room enough: it slips out of others.
+        A wide thing slips out of tilted grasps. For it, the most upright grasp with sufficient
+        clearance is first.
 
         Args:
             thing: A box, cylinder or sphere, in the frame of the arm's base.
             others: What is around it: the table, other things.
             start: A posture (n,); results tend to be near it.
-            enough: How many are looked for.
+            enough: Number of grasps after which the search stops.
         """
         if thing.kind == "floor":
             raise ConfigError(f"{thing.name}: a floor cannot be grasped")
@@ -120,8 +122,8 @@ class GraspPlanner:
         return NoGrasp(reason=f"{thing.name}: {nearest.reason}")
 
     def _ordered(self, found: Sequence[Grasp], thing: Thing) -> list[Grasp]:
-        room = ROOM_M if narrowest_width(thing) > WIDE * self._opening.widest else math.inf
-        return sorted(found, key=lambda one: (-min(one.clearance, room), one.tilt))
+        sufficient = ROOM_M if narrowest_width(thing) > WIDE * self._opening.widest else math.inf
+        return sorted(found, key=lambda one: (-min(one.clearance, sufficient), one.tilt))
 
     def _checker(self, things: Sequence[Thing], width: float) -> CollisionChecker:
         opening = self._opening.position(_opened(width, self._opening))
@@ -141,8 +143,8 @@ class GraspPlanner:
     def _before(
         self, checker: CollisionChecker, tool: Frame, posture: Floats
     ) -> Floats | OutOfReach:
-        """Return the posture from which the tool can go straight to the thing."""
-        last: OutOfReach | None = None
+        """Return a posture from which the tool can move straight to the thing."""
+        fault: OutOfReach | None = None
         for retreat in RETREATS_M:
             goal = ToolGoal(
                 position=tool.position - retreat * tool.axes[:, 0],
@@ -158,13 +160,13 @@ class GraspPlanner:
                     position_error=before.position_error,
                     orientation_error=before.orientation_error,
                 )  # fmt: skip
-            last = before
-        assert last is not None  # there are retreats
-        return last
+            fault = before
+        assert fault is not None  # RETREATS_M is not empty
+        return fault
 
 
 def candidates(thing: Thing, opening: Opening) -> Iterator[tuple[Frame, float, float]]:
-    """Yield poses of the tool for a thing, with its width [m] and the tilt [rad]."""
+    """Yield poses of the tool for a thing, with the thing's width [m] and the tilt [rad]."""
     for tilt in TILTS_RAD:
         for across, width in _closing_axes(thing):
             level = np.cross(UP, across)
@@ -183,7 +185,7 @@ def candidates(thing: Thing, opening: Opening) -> Iterator[tuple[Frame, float, f
 
 
 def _opened(width: float, opening: Opening) -> float:
-    """Return how far apart the pads are before they close on a thing [m]."""
+    """Return the distance between the pads before they close on a thing [m]."""
     return max(width + 2 * GAP_M, min(width + 2 * WIDE_GAP_M, opening.widest))
 
 
@@ -196,7 +198,7 @@ def _closing_axes(thing: Thing) -> Iterator[tuple[Floats, float]]:
         return
     width = 2 * thing.size[0]
     upright = np.eye(3) if thing.kind == "sphere" else thing.axes
-    ahead = math.atan2(thing.position[1], thing.position[0])  # across the way to it, first
+    ahead = math.atan2(thing.position[1], thing.position[0])  # the first is across this direction
     first = np.array([-math.sin(ahead), math.cos(ahead), 0.0])
     axis = upright[:, 2]
     first = first - axis * (axis @ first)

@@ -1,8 +1,8 @@
-"""Inverse kinematics: the posture in which the tool is where it should be, or why there is none.
+"""Inverse kinematics: finds a posture for a pose of the tool, or explains why there is none.
 
-Damped least squares (Levenberg and Marquardt) within the limits of the joints. The place goes
-before the orientation: an arm with five joints has few of the orientations, but can be in most
-places. It starts from the given posture, then from those of a table that come nearest to the goal.
+Damped least squares (Levenberg-Marquardt) within the limits of the joints. The position is more
+important than the orientation: an arm with five joints reaches most positions, but in few
+orientations. It starts from the given posture, then from the nearest ones of a table.
 """
 
 import functools
@@ -20,24 +20,24 @@ from gigabrain_zenoh.manipulation.descent import APPROACH, AXES, PLACE, Flags, d
 POSITION_TOLERANCE_M = 1e-4
 ORIENTATION_TOLERANCE_RAD = 0.01
 ARMS_LENGTH_M = 0.05  # a radian of orientation counts as much as this distance
-FIRST_M = 0.001  # the same, where orientation has to stand back
+FIRST_M = 0.001  # the same, where the position comes first
 TABLE_POSTURES = 3000
-FIRST_STEPS, STEPS = 15, 60  # of a descent: from each start, and from where it comes near
-NEAR_M = 0.001  # of both errors together, beyond those that the goal allows
-AT_ONCE = 4  # descents from postures of the table
-NEAREST = 6  # where no posture reaches the goal: those from which it is tried in earnest
-NEAR_TRIES, TRIES = 16, 60  # postures of the table: those nearest to the goal, then any others
+FIRST_STEPS, STEPS = 15, 60  # of a descent: from each start, and to refine a near posture
+NEAR_M = 0.001  # largest combined error of a near posture, beyond the goal's tolerance
+AT_ONCE = 4  # start postures of one call of `descend`
+NEAREST = 6  # postures that are refined if none reaches the goal
+NEAR_TRIES, TRIES = 16, 60  # start postures: the nearest of the table, and the total
 
 Cause = Literal["too_far", "joint_limit", "orientation", "collision", "invalid"]
-Collides = Callable[[Floats], str]  # of a posture: what touches what, empty for nothing
+Collides = Callable[[Floats], str]  # names what touches in a posture; empty if nothing does
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ToolGoal:
     """The wanted pose of the tool, in the frame of the arm's base.
 
-    With `axes` its whole orientation counts, with `approach` alone only the direction of its
-    x axis, with neither its place only.
+    With `axes`, its full orientation counts; with `approach`, the direction of its x axis; with
+    neither, only its position.
     """
 
     position: Floats  # (3,) [m]
@@ -47,7 +47,7 @@ class ToolGoal:
 
     @functools.cached_property
     def frame(self) -> Floats:
-        """Its axes and place (3, 4); zeros for what does not count."""
+        """Its axes and position (3, 4); zeros for axes that do not count."""
         frame = np.zeros((3, 4))
         frame[:, 3] = self.position
         if self.axes is not None:
@@ -58,7 +58,7 @@ class ToolGoal:
 
     @property
     def part(self) -> int:
-        """Which part of the frame counts."""
+        """The part of the frame that counts: PLACE, APPROACH or AXES."""
         if self.axes is not None:
             return AXES
         return PLACE if self.approach is None else APPROACH
@@ -79,7 +79,7 @@ class ToolGoal:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Reachable:
-    """A posture in which the tool is where it should be."""
+    """A posture in which the tool meets its goal."""
 
     posture: Floats  # (n,) [rad] or [m]
     position_error: float  # [m]
@@ -88,35 +88,35 @@ class Reachable:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class OutOfReach:
-    """A goal that the tool does not reach: why, and the posture that comes nearest to it."""
+    """A goal that the tool does not reach: the reason, and the nearest posture."""
 
     cause: Cause
     reason: str  # for people
-    posture: Floats | None  # (n,) [rad] or [m]; None for a goal that is none
+    posture: Floats | None  # (n,) [rad] or [m]; None for an invalid goal
     position_error: float = math.inf  # [m]
     orientation_error: float = math.inf  # [rad]
 
 
 @dataclass(frozen=True, eq=False)
-class _Found:
-    """The posture in which a descent has ended, and its errors."""
+class _DescentEnd:
+    """The posture at the end of a descent, and its errors."""
 
     posture: Floats
-    held: Flags  # (n,) joints that would go on, were they not at their limits
+    held: Flags  # (n,) joints that their limits keep from moving on
     position_error: float
     orientation_error: float
 
     def reaches(self, goal: ToolGoal) -> bool:
-        near = self.position_error < POSITION_TOLERANCE_M
-        return near and self.orientation_error <= goal.orientation_tolerance
+        at_position = self.position_error < POSITION_TOLERANCE_M
+        return at_position and self.orientation_error <= goal.orientation_tolerance
 
     @property
     def cost(self) -> float:
-        """Both errors together, as the descent weighs them [m]."""
+        """The combined error, as the descent weighs it [m]."""
         return math.hypot(self.position_error, ARMS_LENGTH_M * self.orientation_error)
 
     def rank(self) -> tuple[float, float]:
-        """The place first, in steps within which the orientation decides."""
+        """Sort key: the position error in steps of 1 mm, then the orientation error."""
         steps = round(self.position_error / (10 * POSITION_TOLERANCE_M))
         return steps, round(self.orientation_error, 2)
 
@@ -128,7 +128,7 @@ class _Found:
 
 
 class InverseKinematics:
-    """Solves for postures of one arm, deterministically. Not for two threads at once."""
+    """Deterministic solver for the postures of one arm. Not for two threads at once."""
 
     def __init__(self, arm: ArmKinematics, spare: float = 0.0) -> None:
         """Take an arm; `spare` is the share of each joint's range to keep free at its ends."""
@@ -147,55 +147,55 @@ class InverseKinematics:
         collides: Collides | None = None,
         tries: int = TRIES,
     ) -> Reachable | OutOfReach:
-        """Return the first posture that is found, or why there is none.
+        """Return the first posture found, or the reason why there is none.
 
         Args:
-            goal: Where the tool should be.
-            start: A posture (n,) to begin with, as the present one; results tend to be near it.
-            collides: Says what a posture touches that it must not.
-            tries: Postures of the table to begin with; few find most goals, and fail sooner.
+            goal: Wanted pose of the tool.
+            start: First start posture (n,), such as the present one; results tend to be near it.
+            collides: Returns the forbidden contact of a posture as text; empty if there is none.
+            tries: Start postures from the table; a few reach most goals, and fail sooner.
         """
         if fault := goal.fault:
             return OutOfReach(cause="invalid", reason=fault, posture=None)
-        found: list[_Found] = []
+        found: list[_DescentEnd] = []
         touching: OutOfReach | None = None
-        for now in self._found(goal, start, tries):
-            found.append(now)
-            if now.reaches(goal):
-                touches = collides(now.posture) if collides else ""
+        for end in self._descents(goal, start, tries):
+            found.append(end)
+            if end.reaches(goal):
+                touches = collides(end.posture) if collides else ""
                 if not touches:
                     return Reachable(
-                        posture=now.posture,
-                        position_error=now.position_error,
-                        orientation_error=now.orientation_error,
+                        posture=end.posture,
+                        position_error=end.position_error,
+                        orientation_error=end.orientation_error,
                     )
-                touching = touching or now.out_of_reach("collision", f"collides: {touches}")
+                touching = touching or end.out_of_reach("collision", f"collides: {touches}")
         return touching or self._explain(self._nearest(goal, found))
 
-    def _found(self, goal: ToolGoal, start: Floats | None, tries: int) -> Iterator[_Found]:
-        """Yield the ends of all descents, few at a time: an early one often reaches the goal."""
+    def _descents(self, goal: ToolGoal, start: Floats | None, tries: int) -> Iterator[_DescentEnd]:
+        """Yield the ends of all descents, a few at a time: an early one often reaches the goal."""
         if start is not None:
             yield from self._ends(goal, np.clip(start, *self._limits)[None])
         starts = self._starts(goal, tries)
         for at in range(0, len(starts), AT_ONCE):
             yield from self._ends(goal, starts[at : at + AT_ONCE])
 
-    def _ends(self, goal: ToolGoal, starts: Floats) -> Iterator[_Found]:
+    def _ends(self, goal: ToolGoal, starts: Floats) -> Iterator[_DescentEnd]:
         near = NEAR_M + ARMS_LENGTH_M * goal.orientation_tolerance
-        for now in self._descend(goal, starts, FIRST_STEPS):
-            yield self._refined(goal, now) if now.cost < near else now
+        for end in self._descend(goal, starts, FIRST_STEPS):
+            yield self._refined(goal, end) if end.cost < near else end
 
-    def _nearest(self, goal: ToolGoal, found: Sequence[_Found]) -> _Found:
-        """Return what comes nearest to a goal that is out of reach, the place before the rest."""
+    def _nearest(self, goal: ToolGoal, found: Sequence[_DescentEnd]) -> _DescentEnd:
+        """Return the nearest posture to an unreachable goal; the position comes first."""
         best = sorted(found, key=lambda one: one.cost)[:NEAREST]
         refined = [self._refined(goal, one) for one in best]
         if goal.part != PLACE:
             starts = self._starts(ToolGoal(position=goal.position), NEAREST)[:NEAREST]
             refined += self._descend(goal, starts, STEPS, FIRST_M)
-        return min(refined, key=_Found.rank)
+        return min(refined, key=_DescentEnd.rank)
 
     def _starts(self, goal: ToolGoal, tries: int) -> Floats:
-        """Return the postures of the table (k, n) to begin with."""
+        """Return start postures (k, n) from the table."""
         off = ((self._places - goal.position) ** 2).sum(axis=1)
         if goal.axes is not None:
             off += ARMS_LENGTH_M**2 * ((self._axes - goal.axes) ** 2).sum(axis=(1, 2))
@@ -206,8 +206,8 @@ class InverseKinematics:
         nearest = nearest[np.argsort(off[nearest], kind="stable")]
         return np.concatenate((self._table[nearest], self._table[: tries - near]))
 
-    def _refined(self, goal: ToolGoal, found: _Found) -> _Found:
-        """Descend as far as it goes; where the orientation pulls the tool away, it stands back."""
+    def _refined(self, goal: ToolGoal, found: _DescentEnd) -> _DescentEnd:
+        """Descend to the end; if the orientation pulls the tool away, lower its weight."""
         for weight in (FIRST_M, 0.0):
             if found.position_error >= POSITION_TOLERANCE_M:
                 (found,) = self._descend(goal, found.posture[None], STEPS, weight)
@@ -215,17 +215,17 @@ class InverseKinematics:
 
     def _descend(
         self, goal: ToolGoal, starts: Floats, steps: int, weight: float = ARMS_LENGTH_M
-    ) -> list[_Found]:
-        """Return the ends of descents from postures (k, n)."""
+    ) -> list[_DescentEnd]:
+        """Return the end of the descent from each of `starts` (k, n)."""
         postures, held = starts.copy(), np.zeros(starts.shape, np.bool_)
         errors = np.empty((len(starts), 2))
         frame, part = goal.frame, goal.part
         weight = 0.0 if part == PLACE else weight
         descend(self.arm.chain, self._limits, frame, part, weight, steps, postures, held, errors)
         ends = zip(postures, held, errors.tolist(), strict=True)
-        return [_Found(posture, stuck, *off) for posture, stuck, off in ends]
+        return [_DescentEnd(posture, stopped, *error) for posture, stopped, error in ends]
 
-    def _explain(self, found: _Found) -> OutOfReach:
+    def _explain(self, found: _DescentEnd) -> OutOfReach:
         arm = self.arm
         held = " and ".join(
             f"{arm.names[joint]} is at its limit of {arm.show(joint, found.posture[joint])}"
@@ -241,9 +241,9 @@ class InverseKinematics:
 
 
 def spread(count: int, dimensions: int) -> Floats:
-    """Return points (count, dimensions) in 0 to 1 that cover it evenly (Roberts' sequence)."""
+    """Return points (count, dimensions) spread evenly over 0 to 1 (Roberts' sequence)."""
     root = 2.0
-    for _ in range(60):  # towards the root of x**(dimensions + 1) = x + 1
+    for _ in range(60):  # converges to the root of x**(dimensions + 1) = x + 1
         root = (1.0 + root) ** (1.0 / (dimensions + 1))
     steps = root ** -np.arange(1.0, dimensions + 1)
     return np.asarray((0.5 + np.outer(np.arange(1, count + 1), steps)) % 1.0)

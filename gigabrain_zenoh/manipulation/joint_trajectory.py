@@ -1,11 +1,11 @@
 """Times a path of postures within the limits of speed, acceleration and jerk, by Ruckig.
 
 Ruckig's community edition plans from one state to the next; intermediate waypoints need its cloud
-service. So states at the corners of a path are chosen here: where all joints go on in the direction
-in which they came, they pass through with a speed, as monotone cubic interpolation does; where the
-path bends back they stop. A curve through corners strays from the straight lines that were
-found free, so its postures are looked at once more: where one is not free, it passes more slowly,
-and at last stops, which is a straight line again.
+service. So this module chooses the states at the corners of a path. A joint that goes on in the
+same direction passes a corner with a speed, as in monotone cubic interpolation. A joint that turns
+back stops there. A curve through corners leaves the straight lines that were checked, so its
+postures are checked again. Where one is not free, the arm passes the corner more slowly, and at
+last stops there, which gives a straight line again.
 
 Berscheid and Kröger, Jerk-limited real-time trajectory generation with arbitrary target states,
 RSS 2021.
@@ -25,17 +25,17 @@ from gigabrain_zenoh.errors import Refused
 from gigabrain_zenoh.manipulation.collision import CollisionChecker
 
 PERIOD_S = 0.02  # between points
-SPEEDS = (1.0, 0.7, 0.5, 0.35, 0.2, 0.1, 0.0)  # shares of the speed at corners that are tried
-FAST = 0.5  # of the joints' speeds
-ACCELERATION_SHARE = 0.5
-MAX_STRAY = 0.02  # of a part's longest move
-SPARE = 1e-9
-MARGIN_SHARE = 0.5  # of the checker's margin, that is kept where corners are cut
+SPEEDS = (1.0, 0.7, 0.5, 0.35, 0.2, 0.1, 0.0)  # shares of a corner's speed, in the order of tries
+FAST = 0.5  # share of the joints' top speeds
+ACCELERATION_SHARE = 0.5  # of the joints' largest acceleration and jerk
+MAX_STRAY = 0.02  # share of a part's longest joint motion
+MIN_MOVE = 1e-9  # [rad] or [m]; smaller moves are left out
+MARGIN_SHARE = 0.5  # of the checker's margin, which is kept where corners are cut
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class JointTrajectory:
-    """The motion of joints over time. It begins with the present state and ends at rest."""
+    """Motion of joints over time. It begins at the present state and ends at rest."""
 
     names: tuple[str, ...]
     times: Floats  # (k,) [s] from the start, rising
@@ -45,16 +45,16 @@ class JointTrajectory:
 
     @property
     def duration(self) -> float:
-        """Return the duration [s]."""
+        """The time from the start to the end [s]."""
         return float(self.times[-1])
 
 
 def eased(
     joints: Sequence[JointDescription], speed: float, acceleration: float = ACCELERATION_SHARE
 ) -> list[JointDescription]:
-    """Return joints with shares of the speed, and of the acceleration and jerk, that they can.
+    """Return joints with lower limits: shares of their speed, and of their acceleration and jerk.
 
-    What is left is for control: a joint that lags is sent ahead by its speed, and corrected.
+    The rest is for control, which corrects joints that lag.
     """
     return [
         replace(
@@ -68,7 +68,7 @@ def eased(
 
 
 class TimeParametrization:
-    """Makes trajectories within the limits of some joints."""
+    """Makes trajectories within the limits of the given joints."""
 
     def __init__(self, joints: Sequence[JointDescription], period: float = PERIOD_S) -> None:
         """Take the joints' limits; points are `period` [s] apart."""
@@ -88,17 +88,17 @@ class TimeParametrization:
         Args:
             postures: From the start to the goal, with straight lines between them.
             velocity: Of the joints at the start (n,); at rest otherwise.
-            checker: Says where the arm may be.
+            checker: Checks the trajectory for collisions; without it, none are looked for.
 
         Raises:
-            Refused: The start is so fast that limits or the checker's margin would be broken.
+            Refused: The start is too fast for the limits or the checker's margin.
         """
         rest = np.zeros(postures.shape[1])
         start = rest if velocity is None else velocity
-        distinct = np.abs(np.diff(postures, axis=0)).max(axis=1) > SPARE
+        distinct = np.abs(np.diff(postures, axis=0)).max(axis=1) > MIN_MOVE
         postures = postures[np.concatenate(([True], distinct))]
         speeds = self._corner_speeds(postures)
-        shares = np.zeros(len(speeds), int)  # of SPEEDS, of each posture
+        shares = np.zeros(len(speeds), int)  # index into SPEEDS for each posture
         while True:
             states = [start, *(speeds[k] * SPEEDS[shares[k]] for k in range(1, len(speeds)))]
             parts, bad = self._parts(postures, states, checker)
@@ -110,29 +110,29 @@ class TimeParametrization:
         return self._sampled(postures[0], min(parts, stops, key=_duration))
 
     def _corner_speeds(self, postures: Floats) -> list[Floats]:
-        """Return the velocity (n,) at each posture: 0 at the ends and where a joint turns back."""
+        """Return the velocity (n,) at each posture: 0 at the ends, and where a joint turns back."""
         moves = np.diff(postures, axis=0)
-        times = (np.abs(moves) / self._speeds).max(axis=1, initial=SPARE)
+        times = (np.abs(moves) / self._speeds).max(axis=1, initial=MIN_MOVE)
         slopes = moves / times[:, None]
         rest = np.zeros(postures.shape[1])
         found = [rest]
         for before, after in pairwise(slopes):
             onward = before * after > 0
             mean = 2 * before * after / np.where(onward, before + after, 1.0)
-            mean = np.clip(mean, -self._speeds, self._speeds)  # it may be beyond by rounding
+            mean = np.clip(mean, -self._speeds, self._speeds)  # rounding may exceed the limit
             found.append(np.where(onward, mean, 0.0))
         return [*found, rest] if len(postures) > 1 else found
 
     def _parts(
         self, postures: Floats, states: Sequence[Floats], checker: CollisionChecker | None
     ) -> tuple[list[ruckig.Trajectory], list[int]]:
-        """Return the trajectories between postures, and corners that were passed too fast."""
+        """Return the trajectories between postures, and the corners that are passed too fast."""
         parts, bad = [], set()
         for k in range(len(postures) - 1):
             part = self._part(postures[k], states[k], postures[k + 1], states[k + 1])
             parts.append(part)
             corners = [c for c in (k, k + 1) if 0 < c < len(postures) - 1 and np.any(states[c])]
-            moving = k == 0 and bool(np.any(states[0]))  # it may have to turn back first
+            moving = k == 0 and bool(np.any(states[0]))  # it may have to turn round first
             strays = not moving and _strays(part, postures[k : k + 2])
             if (corners or moving) and (strays or not self._is_clear(part, checker)):
                 if not corners:
@@ -144,19 +144,19 @@ class TimeParametrization:
         self, start: Floats, velocity: Floats, goal: Floats, goal_velocity: Floats
     ) -> ruckig.Trajectory:
         count = len(start)
-        given, result = ruckig.InputParameter(count), ruckig.Trajectory(count)
-        given.current_position, given.current_velocity = start.tolist(), velocity.tolist()
-        given.current_acceleration = given.target_acceleration = [0.0] * count
-        given.target_position, given.target_velocity = goal.tolist(), goal_velocity.tolist()
-        given.max_velocity = [one.max_speed for one in self.joints]
-        given.max_acceleration = [one.max_acceleration for one in self.joints]
-        given.max_jerk = [one.max_jerk for one in self.joints]
-        given.synchronization = ruckig.Synchronization.Phase  # a straight line from rest to rest
+        request, result = ruckig.InputParameter(count), ruckig.Trajectory(count)
+        request.current_position, request.current_velocity = start.tolist(), velocity.tolist()
+        request.current_acceleration = request.target_acceleration = [0.0] * count
+        request.target_position, request.target_velocity = goal.tolist(), goal_velocity.tolist()
+        request.max_velocity = [one.max_speed for one in self.joints]
+        request.max_acceleration = [one.max_acceleration for one in self.joints]
+        request.max_jerk = [one.max_jerk for one in self.joints]
+        request.synchronization = ruckig.Synchronization.Phase  # a straight line from rest to rest
         try:
-            self._otg.calculate(given, result)
+            self._otg.calculate(request, result)
         except ruckig.RuckigError as error:
-            why = str(error).strip()
-            raise Refused(f"no trajectory within the limits of the joints: {why}") from None
+            problem = str(error).strip()
+            raise Refused(f"no trajectory within the limits of the joints: {problem}") from None
         return result
 
     def _is_clear(self, part: ruckig.Trajectory, checker: CollisionChecker | None) -> bool:
@@ -188,8 +188,8 @@ def _duration(parts: Sequence[ruckig.Trajectory]) -> float:
 
 
 def _strays(part: ruckig.Trajectory, ends: Floats) -> bool:
-    """Return whether a part leaves the box between its ends (2, n)."""
-    spare = MAX_STRAY * np.abs(ends[1] - ends[0]).max()
-    low, high = ends.min(axis=0) - spare, ends.max(axis=0) + spare
+    """Return whether a part leaves the box in joint space between its `ends` (2, n)."""
+    tolerance = MAX_STRAY * np.abs(ends[1] - ends[0]).max()
+    low, high = ends.min(axis=0) - tolerance, ends.max(axis=0) + tolerance
     extremes = zip(part.position_extrema, low, high, strict=True)
     return any(one.min < lower or one.max > upper for one, lower, upper in extremes)

@@ -1,4 +1,4 @@
-"""Phases of a plan, and how they are carried out: one wish for the joints in each tick."""
+"""Phases of a plan, and their execution: targets for the joints in each tick."""
 
 import functools
 import math
@@ -19,13 +19,13 @@ PhaseName = Literal[
     "hover", "descend", "close", "squeeze", "lift", "traverse", "lower", "open", "retreat",
     "move", "grip", "press", "hold",
 ]  # fmt: skip
-GRIP_TICKS = 40  # until a gripper has closed, or has stopped at what is between its fingers
-LATE_TICKS = 250  # by which that may last longer, where safety slows it down
-SETTLE_TICKS = 12  # after a trajectory
-AHEAD_TICKS = 1  # from a state to the tick in which a command by it moves joints
-LAG_TICKS = 1  # from there until a state shows that it did, where a process is late
-NO_WAY = 1e-6  # [rad] or [m] in a tick, of a joint that a path leaves where it is
-WINDOW_TICKS = 100  # of a trajectory in an intent
+GRIP_TICKS = 40  # until a gripper has closed, or is stopped by an object
+LATE_TICKS = 250  # longest extension, if safety slows the gripper down
+SETTLE_TICKS = 12  # at rest after a trajectory
+AHEAD_TICKS = 1  # from a state to the joints' first motion by a command that is based on it
+LAG_TICKS = 1  # from that motion until a state shows it, if a process is late
+MIN_MOVE = 1e-6  # [rad] or [m] per tick; a joint that moves less is at rest
+WINDOW_TICKS = 100  # length of the trajectory in an intent
 assert WINDOW_TICKS * TICK_S <= LONGEST_WINDOW_S
 
 
@@ -35,7 +35,7 @@ class Phase:
 
     name: PhaseName
     arm: JointTrajectory | None = None
-    gripper: float | None = None  # [rad] or [m], where its joint goes
+    gripper: float | None = None  # [rad] or [m], target of its joint
 
     @functools.cached_property
     def ticks(self) -> int:
@@ -45,7 +45,7 @@ class Phase:
         return math.ceil(self.arm.duration / TICK_S) + 1 + SETTLE_TICKS
 
     def at(self, ticks: NDArray[np.int64]) -> Floats:
-        """Return the postures (k, n) of the arm some ticks after the start."""
+        """Return the postures (k, n) of the arm at `ticks` (k,) after the start."""
         return self._postures[np.clip(ticks, 0, len(self._postures) - 1)]
 
     @functools.cached_property
@@ -57,24 +57,24 @@ class Phase:
 
 
 class PhaseRun:
-    """Carries out phases one after the other, by the robot's ticks."""
+    """Executes phases one after the other, timed by the robot's ticks."""
 
     def __init__(self, phases: Sequence[Phase], gripper: str, tick: int) -> None:
         """Begin at `tick`; `gripper` names its joint."""
         self._phases, self._gripper = tuple(phases), gripper
         self._begun, self._at = tick, 0
-        self._paced, self.waited = tick, 0  # ticks for which the present phase has not gone on
+        self._paced, self.waited = tick, 0  # `waited`: ticks without progress in the present phase
         self._total = sum(phase.ticks for phase in phases)
 
     @property
     def phase(self) -> Phase | None:
-        """The present phase; None once all are over."""
+        """The present phase; None after the last one."""
         return self._phases[self._at] if self._at < len(self._phases) else None
 
     def advance(self, tick: int, *, grips: bool = False) -> Phase | None:
-        """Return the phase that is over at `tick`, and begin the next one; else None.
+        """If a phase ends at `tick`, begin the next one and return the ended one; else None.
 
-        While the gripper still `grips`, which a busy machine delays, its phase lasts longer.
+        While the gripper still moves (`grips`), as on a busy machine, its phase lasts longer.
         """
         phase = self.phase
         if phase is None:
@@ -87,18 +87,18 @@ class PhaseRun:
         return phase
 
     def wait(self, tick: int, sent: Mapping[str, float], spare: Mapping[str, float]) -> str:
-        """Stretch time while joints are sent less far along their path than they should be.
+        """Stretch time while the sent positions are behind the planned ones.
 
-        So a trajectory waits for a gate that slows joints down, and all of them stay on it. How
-        well they follow what is sent does not count.
+        So a trajectory waits for a gate that slows joints down, and all joints stay on it. Only
+        sent positions count, not how well the joints follow them.
 
         Args:
-            tick: Of the state.
-            sent: Where the joints were sent [rad] or [m].
-            spare: By how much that may be behind [rad] or [m]: what control corrects.
+            tick: Tick of the state.
+            sent: Newest goals of the joints [rad] or [m].
+            spare: Lag that control corrects itself [rad] or [m], by joint.
 
         Returns:
-            The joint for which it waits, or an empty text.
+            The joint that it waits for, or an empty text.
         """
         phase, before, self._paced = self.phase, self._paced - self._begun, tick
         if phase is None or phase.arm is None:
@@ -107,7 +107,7 @@ class PhaseRun:
         rows = phase.at(np.arange(before, tick - self._begun + 1) - late)
         ways = np.diff(rows, axis=0)
         off = np.sign(ways) * (rows[1:] - [sent[name] for name in names])
-        behind = (off > [spare[name] for name in names]) & (np.abs(ways) > NO_WAY)
+        behind = (off > [spare[name] for name in names]) & (np.abs(ways) > MIN_MOVE)
         (held,) = np.nonzero(behind.any(axis=1))
         if not len(held):
             self.waited = 0
@@ -119,14 +119,14 @@ class PhaseRun:
         return names[int(np.argmax(behind[gone]))]
 
     def insert(self, phase: Phase) -> None:
-        """Carry out another phase before the present one, which has just begun."""
+        """Execute another phase before the present one, which has just begun."""
         self._phases = (*self._phases[: self._at], phase, *self._phases[self._at :])
         self._total += phase.ticks
 
     def wish(self, tick: int) -> tuple[tuple[JointTarget, ...], JointWindow | None]:
-        """Return the targets, or the part of a trajectory, for the intent of a state of `tick`.
+        """Return targets, or a window of the trajectory, for an intent that is based on `tick`.
 
-        Once all phases are over it is the end of the last one, where the joints may not be yet.
+        After the last phase it is the end of that phase, which the joints may not have reached.
         """
         phase = self.phase or self._phases[-1]
         if phase.arm is None:
@@ -142,7 +142,10 @@ class PhaseRun:
         )
 
     def expected(self, tick: int) -> dict[str, float]:
-        """Return where the arm's joints should be at `tick` [rad] or [m]; empty for a gripper's."""
+        """Return the planned positions of the arm's joints at `tick` [rad] or [m].
+
+        Empty during a phase of the gripper.
+        """
         phase = self.phase
         if phase is None or phase.arm is None:
             return {}
@@ -150,14 +153,14 @@ class PhaseRun:
         return dict(zip(phase.arm.names, row.tolist(), strict=True))
 
     def over_for(self, tick: int) -> int:
-        """Return how many ticks ago the last phase ended."""
+        """Return the ticks since the last phase ended; 0 before."""
         return 0 if self.phase else tick - self._begun
 
     def left_ticks(self, tick: int) -> int:
-        """Return how many ticks all that is left takes."""
+        """Return the ticks until all phases are over."""
         left = sum(phase.ticks for phase in self._phases[self._at :])
         return max(0, left - (tick - self._begun)) if left else 0
 
     def progress(self, tick: int) -> float:
-        """Return the share that is done."""
+        """Return the done share, 0 to 1."""
         return 1.0 - self.left_ticks(tick) / self._total if self._total else 1.0

@@ -1,9 +1,9 @@
-"""Plans to pick a thing up and to put it down: phases, each a trajectory or a grip.
+"""Plans to pick a thing up and to put it down, as phases: trajectories and grips.
 
     open  hover  descend  close  ease  lift     of a pick
     traverse  lower  open  retreat              of a place
 
-Whoever carries a plan out checks the grip after `close`: the gripper has to stop short.
+The executor of a plan checks the grip after `close`: the gripper must stop before its goal.
 """
 
 import math
@@ -31,16 +31,16 @@ from gigabrain_zenoh.manipulation.joint_trajectory import (
 from gigabrain_zenoh.manipulation.phases import Phase
 from gigabrain_zenoh.manipulation.planner import NoPath, plan
 
-LIMIT_SPARE = 0.006  # of a joint's range, at its ends: servos swing a bit too far
-SLOW = 0.35  # of the joints' speeds, with a thing in the gripper
-CREEP = 0.1  # the same straight to a thing or its place: safety slows single joints near the table
-GENTLE = 0.25  # of their accelerations on the way: servos go on to where they were sent last
-SQUEEZE = 0.12  # of the gripper's range, beyond the thing's width
-LIFT_M = 0.05  # straight up
-PLACE_GAP_M = 0.003  # above what it is put on, when it is let go of
-PLACE_YAWS = 16  # turns of what is put down that are tried
-PLACE_TILT_RAD = math.radians(8)  # by which it may lean when it is let go of
-TRIES = 3  # grasps whose ways are planned
+LIMIT_SPARE = 0.006  # share of a joint's range, kept free at each end: servos overshoot
+SLOW = 0.35  # share of the joints' top speeds, with a thing in the gripper
+CREEP = 0.1  # the same on straight lines near a thing: safety slows joints down near the table
+GENTLE = 0.25  # share of their accelerations on the way to a place: servos overshoot a stop
+SQUEEZE = 0.12  # share of the gripper's range by which its goal is beyond the thing's width
+LIFT_M = 0.05  # height of the straight lift
+PLACE_GAP_M = 0.003  # height above the surface, at which a thing is let go
+PLACE_YAWS = 16  # yaw angles in which a thing may be put down
+PLACE_TILT_RAD = math.radians(8)  # largest tilt of a thing that is let go
+TRIES = 3  # grasps for which a path is planned
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -50,12 +50,12 @@ class Pick:
     grasp: Grasp
     phases: tuple[Phase, ...]
     held: Thing  # in the frame of the tool
-    grasps: tuple[Grasp, ...] = ()  # all that were found, the best first
+    grasps: tuple[Grasp, ...] = ()  # all possible ones, the best first
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Place:
-    """A plan to put down a thing that is held."""
+    """A plan to put down the held thing."""
 
     phases: tuple[Phase, ...]
 
@@ -65,7 +65,7 @@ class NoWay:
     """The reason why something cannot be picked up or put down."""
 
     reason: str  # for people
-    stand_off: float | None = None  # [m], how far ahead of its base a thing can be picked up
+    stand_off: float | None = None  # [m], distance ahead of its base at which picking succeeds
 
 
 class PickPlacePlanner:
@@ -87,13 +87,13 @@ class PickPlacePlanner:
     def pick(
         self, thing: Thing, others: Sequence[Thing], posture: Floats, without: int = 0
     ) -> Pick | NoWay:
-        """Return how to pick a thing up, or why it cannot be.
+        """Plan to pick a thing up, or return why that is impossible.
 
         Args:
             thing: A box, cylinder or sphere, in the frame of the arm's base.
             others: What is around it: the table, other things.
-            posture: Where the arm is (n,).
-            without: Grasps that have failed already: the next ones are taken.
+            posture: Present posture (n,).
+            without: Number of the best grasps to skip, as they have failed.
         """
         found = self._grasps.grasps(thing, others, posture)
         if isinstance(found, NoGrasp):
@@ -109,11 +109,11 @@ class PickPlacePlanner:
         return fault
 
     def can_grasp(self, thing: Thing, others: Sequence[Thing], posture: Floats) -> bool:
-        """Return whether there is a way to grasp a thing."""
+        """Return whether a thing can be grasped."""
         return not isinstance(self._grasps.grasps(thing, others, posture, enough=1), NoGrasp)
 
     def back_off(self, grasp: Grasp, posture: Floats) -> tuple[Phase, ...]:
-        """Return the way from a thing that is not held: open, and back where it came from."""
+        """Plan the retreat from a thing that is not held: open, and go back along the approach."""
         return (
             Phase(name="open", gripper=grasp.opening),
             Phase(name="retreat", arm=self._straight(posture, grasp.before)),
@@ -122,14 +122,14 @@ class PickPlacePlanner:
     def place(
         self, held: Thing, target: Floats, others: Sequence[Thing], posture: Floats, opening: float
     ) -> Place | NoWay:
-        """Return how to put a held thing down, or why it cannot be.
+        """Plan to put the held thing down, or return why that is impossible.
 
         Args:
-            held: What is held, in the frame of the tool.
-            target: Where its middle shall be (3,) [m], standing as it was picked up.
+            held: The held thing, in the frame of the tool.
+            target: Position of its middle (3,) [m], upright as it was picked up.
             others: What is around.
-            posture: Where the arm is (n,).
-            opening: Where the gripper's joint goes to let go [rad] or [m].
+            posture: Present posture (n,).
+            opening: Position of the gripper's joint to let go [rad] or [m].
         """
         checker = CollisionChecker(
             self.arm, others, held=held, margin=0.001, ignore=may_touch(held, others)
@@ -140,7 +140,7 @@ class PickPlacePlanner:
             if isinstance(one, Place):
                 return one
             faults.append(one)
-        return faults[0]  # of the least turn
+        return faults[0]  # of the smallest turn
 
     def _pick(
         self, grasp: Grasp, thing: Thing, others: Sequence[Thing], posture: Floats
@@ -164,7 +164,7 @@ class PickPlacePlanner:
         return Pick(grasp=grasp, phases=phases, held=held)
 
     def _lifted(self, checker: CollisionChecker, grasp: Grasp) -> Floats:
-        """Return postures (k, n) up from the grasp: straight up, or back where it came from."""
+        """Return postures (k, n) from the grasp straight up, or else back along the approach."""
         here = self.arm.forward(grasp.posture)
         raised = here.position + np.array([0.0, 0.0, LIFT_M])
         goal = ToolGoal(position=raised, approach=here.axes[:, 0], orientation_tolerance=math.pi)
@@ -210,7 +210,7 @@ class PickPlacePlanner:
     def _retreat(
         self, tool: Frame, down: Reachable, held: Thing, others: Sequence[Thing], opening: float
     ) -> JointTrajectory:
-        """Return the way back from what was put down: along the approach, as far as it goes."""
+        """Return the way back along the approach from a released thing, as far as possible."""
         left = _at(self.arm.forward(down.posture), held)
         beside = [(left.name, body) for body in self.arm.hand]  # a finger rests against it
         checker = CollisionChecker(
@@ -225,16 +225,16 @@ class PickPlacePlanner:
         return self._straight(down.posture, down.posture)
 
     def _tools_at(self, held: Thing, target: Floats, posture: Floats) -> list[Frame]:
-        """Return poses of the tool in which what it holds stands at its target."""
+        """Return poses of the tool with the held thing at its target, the smallest turn first."""
         now = self.arm.forward(posture)
         thing = _at(now, held)
-        lowest = target + np.array([0.0, 0.0, PLACE_GAP_M])
+        raised = target + np.array([0.0, 0.0, PLACE_GAP_M])
         found = []
         for number in range(PLACE_YAWS):
             angle = 2 * math.pi * number / PLACE_YAWS
             turn = turned(angle) @ _upright(thing.axes) @ thing.axes.T
             axes = turn @ now.axes
-            found.append(Frame(position=lowest - axes @ held.position, axes=axes))
+            found.append(Frame(position=raised - axes @ held.position, axes=axes))
         order = [float(np.trace(now.axes.T @ one.axes)) for one in found]
         return [found[k] for k in np.argsort(order)[::-1]]
 
@@ -242,9 +242,9 @@ class PickPlacePlanner:
         return self._creep.trajectory(np.stack((start, goal)))
 
     def _held(self, thing: Thing, grasp: Grasp) -> Thing:
-        """Return a thing in the frame of the tool, between fingers that have closed on it.
+        """Return a thing in the frame of the tool, after the fingers have closed on it.
 
-        Where one finger alone moves, it pushes the thing to the other one.
+        A single moving finger pushes the thing to the other one.
         """
         tool = self.arm.forward(grasp.posture)
         place = tool.axes.T @ (thing.position - tool.position)
@@ -252,7 +252,7 @@ class PickPlacePlanner:
         return replace(thing, position=place, axes=tool.axes.T @ thing.axes)
 
     def _squeezed(self, grasp: Grasp) -> float:
-        """Return where the gripper's joint goes to hold a thing: beyond its width."""
+        """Return the goal of the gripper's joint to hold a thing: beyond its width."""
         closing = math.copysign(1.0, grasp.closed - grasp.opening)
         span = self._gripper.upper - self._gripper.lower
         aim = grasp.closed + closing * SQUEEZE * span
@@ -260,7 +260,7 @@ class PickPlacePlanner:
 
 
 def may_touch(held: Thing, others: Sequence[Thing]) -> list[tuple[str, str]]:
-    """Return what the held thing may touch: that on which it stands."""
+    """Return the pairs that may touch: the held thing, and a floor on which it stands."""
     return [("held", other.name) for other in others if other.kind == "floor"]
 
 
@@ -270,7 +270,7 @@ def _at(tool: Frame, held: Thing) -> Thing:
 
 
 def _upright(axes: Floats) -> Floats:
-    """Return axes (3, 3) turned by the smallest angle so that the last one points up."""
+    """Return `axes` (3, 3), turned by the smallest angle so that the last one points up."""
     up = np.array([0.0, 0.0, 1.0])
     axis = np.cross(axes[:, 2], up)
     sin, cos = float(np.linalg.norm(axis)), float(axes[2, 2])

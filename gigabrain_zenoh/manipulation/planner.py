@@ -1,4 +1,4 @@
-"""Plans paths of postures that touch nothing: RRT-Connect, then shortcuts.
+"""Plans collision-free paths of postures: RRT-Connect, then shortcuts.
 
 Kuffner and LaValle, RRT-Connect: an efficient approach to single-query path planning, ICRA 2000.
 """
@@ -13,12 +13,12 @@ import numpy as np
 from gigabrain_schemas.arrays import Floats
 from gigabrain_zenoh.manipulation.collision import CollisionChecker
 
-BRANCH = 0.5  # [rad] or [m] of the joint that moves most, of a branch of a tree
-SHORTCUTS = 40
-MAX_OVERLAP_M = 0.01  # of the start with what it touches: from deeper in it does not leave
-LEAVING = (0.02, 0.05, 0.1)  # [rad] or [m] of the joint that moves most, to leave a tight start
-LEAVING_TRIES = 40  # directions of each
-LEAVING_PARTS = 4  # of the way, in which it must not come nearer to anything
+BRANCH_LENGTH = 0.5  # [rad] or [m], of the joint that moves most
+SHORTCUTS = 40  # tries
+MAX_OVERLAP_M = 0.01  # of a start in collision; from a deeper one no path is planned
+ESCAPE_LENGTHS = (0.02, 0.05, 0.1)  # [rad] or [m], of the joint that moves most
+ESCAPE_TRIES = 40  # random directions for each length
+ESCAPE_PARTS = 4  # of the way, between which the clearance is checked
 TIME_LIMIT_S = 2.0
 
 NoPathCause = Literal["limits", "start", "goal", "time"]
@@ -33,44 +33,44 @@ class JointPath:
 
 @dataclass(frozen=True, kw_only=True)
 class NoPath:
-    """The reason why there is no path."""
+    """The reason for a missing path."""
 
     cause: NoPathCause
     reason: str  # for people
 
 
 class Tree:
-    """Postures that can be reached from a root, each by a straight line from an earlier one."""
+    """Postures reachable from a root, each by a straight line from an earlier one."""
 
     def __init__(self, root: Floats) -> None:
         self._postures = np.empty((256, len(root)))
-        self._before = [-1]
+        self._parents = [-1]
         self._postures[0] = root
 
     def nearest(self, posture: Floats) -> int:
-        """Return the number of the posture that is nearest."""
-        off = self._postures[: len(self._before)] - posture
+        """Return the number of the nearest posture."""
+        off = self._postures[: len(self._parents)] - posture
         return int(np.argmin(np.einsum("ij,ij->i", off, off)))
 
     def posture(self, number: int) -> Floats:
         """Return a posture (n,) by its number."""
         return np.asarray(self._postures[number])
 
-    def add(self, posture: Floats, before: int) -> int:
-        """Add a posture behind another, and return its number."""
-        number = len(self._before)
+    def add(self, posture: Floats, parent: int) -> int:
+        """Add a posture with the number of its parent, and return its own number."""
+        number = len(self._parents)
         if number == len(self._postures):
             self._postures = np.concatenate((self._postures, np.empty_like(self._postures)))
         self._postures[number] = posture
-        self._before.append(before)
+        self._parents.append(parent)
         return number
 
-    def way(self, number: int) -> list[Floats]:
-        """Return the postures from the root to one."""
+    def path_to(self, number: int) -> list[Floats]:
+        """Return the postures from the root to the one with this number."""
         found = []
         while number >= 0:
             found.append(self._postures[number].copy())
-            number = self._before[number]
+            number = self._parents[number]
         return found[::-1]
 
 
@@ -82,10 +82,10 @@ def plan(
     seed: int = 0,
     time_limit: float = TIME_LIMIT_S,
 ) -> JointPath | NoPath:
-    """Return a path of postures from `start` to `goal` (n,), or why there is none.
+    """Return a path of postures from `start` to `goal` (n,), or the reason for its absence.
 
-    The same `seed` gives the same path, unless the `time_limit` [s] cuts the search off. A start
-    that is too near to something is left first: servos do not stop exactly where they should.
+    The same `seed` gives the same path, unless the search ends at `time_limit` [s]. A start in
+    collision is left first, if the overlap is small: servos do not stop exactly at their goals.
     """
     for name, posture in (("start", start), ("goal", goal)):
         if not checker.arm.inside(posture):
@@ -94,10 +94,10 @@ def plan(
         return NoPath(cause="goal", reason=f"the goal collides: {touches}")
     random, until, begin = np.random.default_rng(seed), time.monotonic() + time_limit, start
     if touches := checker.touches(start):
-        freed = _freed(checker, start, random)
-        if freed is None:
+        free_start = _escape(checker, start, random)
+        if free_start is None:
             return NoPath(cause="start", reason=f"the start collides: {touches}")
-        begin = freed
+        begin = free_start
     way = [begin, goal]
     if not checker.is_line_free(begin, goal):
         found = _connect(checker, begin, goal, random, until)
@@ -107,18 +107,18 @@ def plan(
     return JointPath(postures=np.array(way if begin is start else [start, *way]))
 
 
-def _freed(checker: CollisionChecker, start: Floats, random: np.random.Generator) -> Floats | None:
-    """Return a free posture beside a start that is not, to which nothing comes nearer."""
+def _escape(checker: CollisionChecker, start: Floats, random: np.random.Generator) -> Floats | None:
+    """Return a free posture near a start in collision; on the way, clearance does not shrink."""
     nearest = checker.clearance(start).distance
     if nearest < -MAX_OVERLAP_M:
         return None
-    for far in LEAVING:
-        for _ in range(LEAVING_TRIES):
+    for length in ESCAPE_LENGTHS:
+        for _ in range(ESCAPE_TRIES):
             way = random.uniform(-1.0, 1.0, len(start))
-            way *= far / np.abs(way).max()
+            way *= length / np.abs(way).max()
             if not (checker.arm.inside(start + way) and checker.is_free(start + way)):
                 continue
-            parts = (start + way * k / LEAVING_PARTS for k in range(1, LEAVING_PARTS))
+            parts = (start + way * k / ESCAPE_PARTS for k in range(1, ESCAPE_PARTS))
             if all(checker.clearance(part).distance >= nearest for part in parts):
                 return np.asarray(start + way)
     return None
@@ -144,7 +144,7 @@ def _connect(
             while number >= 0 and not arrived:
                 number, arrived = _extend(checker, other, number, aim)
             if arrived:
-                ways = growing.way(new), other.way(number)
+                ways = growing.path_to(new), other.path_to(number)
                 first, second = ways if forwards else ways[::-1]
                 return [*first, *second[-2::-1]]
         growing, other, forwards = other, growing, not forwards
@@ -152,11 +152,11 @@ def _connect(
 
 
 def _extend(checker: CollisionChecker, tree: Tree, number: int, aim: Floats) -> tuple[int, bool]:
-    """Add a branch towards `aim`; return its number, -1 for none, and whether it has arrived."""
+    """Add a branch towards `aim`; return its number (-1: none), and whether it reaches `aim`."""
     here = tree.posture(number).copy()
     length = float(np.abs(aim - here).max())
-    arrives = length <= BRANCH
-    new = aim if arrives else here + (aim - here) * (BRANCH / length)
+    arrives = length <= BRANCH_LENGTH
+    new = aim if arrives else here + (aim - here) * (BRANCH_LENGTH / length)
     if checker.is_free(new) and checker.is_line_free(here, new):
         return tree.add(new, number), arrives
     return -1, False
@@ -179,7 +179,7 @@ def _shortened(
 
 
 def _without_detours(checker: CollisionChecker, way: list[Floats]) -> list[Floats]:
-    """Go from each posture to the farthest one that can be seen from it."""
+    """Go from each posture to the last one that a free straight line reaches."""
     kept, here = [way[0]], 0
     while here < len(way) - 1:
         ahead = range(len(way) - 1, here + 1, -1)
@@ -189,7 +189,7 @@ def _without_detours(checker: CollisionChecker, way: list[Floats]) -> list[Float
 
 
 def _along(way: list[Floats], lengths: Floats, length: float) -> tuple[int, Floats]:
-    """Return the part of a way that is `length` from its start, and the posture there."""
+    """Return the part of a way at `length` from its start, and the posture there."""
     ends = np.cumsum(lengths)
     part = min(int(np.searchsorted(ends, length)), len(lengths) - 1)
     share = 1.0 - (ends[part] - length) / max(float(lengths[part]), 1e-12)

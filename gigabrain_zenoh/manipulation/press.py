@@ -1,8 +1,8 @@
-"""Plans how a tool presses something: before it, straight on until it is felt, and back.
+"""Plans how a tool presses something: move before it, straight on until contact, and back.
 
     grip  hover  press      then  hold  retreat
 
-Whoever carries a plan out ends `press` once the tool is pushed back by enough.
+The executor of a plan ends `press` when the push on the tool is strong enough.
 """
 
 import math
@@ -29,13 +29,13 @@ from gigabrain_zenoh.manipulation.phases import Phase
 from gigabrain_zenoh.manipulation.pick_place import CREEP, NoWay
 from gigabrain_zenoh.manipulation.planner import NoPath, plan
 
-RUN_IN_M = 0.04  # before the place, in which it is felt how joints are without a contact
-STEP_M = 0.01  # from posture to posture
-SPEED_M_S = 0.03  # of the tool at most, if one joint moved it
+RUN_IN_M = 0.04  # before the place, to measure efforts and lag without a contact
+STEP_M = 0.01  # between postures
+MAX_SPEED_M_S = 0.03  # of the tool, if a single joint moves it
 MARGIN_M = 0.002
-FLOOR_M = 0.008  # kept free of a floor, near which safety holds joints back
-TILT_RAD = math.radians(10)  # by which the approach may be off
-JUMP_RAD = 0.3  # [rad] or [m] from step to step: that is another posture
+FLOOR_M = 0.008  # clearance from a floor, near which safety slows joints down
+TILT_RAD = math.radians(10)  # largest error of the approach
+MAX_JUMP = 0.3  # [rad] or [m] per step; a larger one is a jump to another solution
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -43,7 +43,7 @@ class PressWay:
     """A plan to press something, and the posture to return to."""
 
     phases: tuple[Phase, ...]
-    before: Floats  # (n,) posture to which the arm goes back
+    before: Floats  # (n,) posture for the return
 
 
 class PressPlanner:
@@ -55,7 +55,7 @@ class PressPlanner:
         self._closed = arm.opening().position(0.0)
         fastest = max(arm.levers(0.0) * [joint.max_speed for joint in arm.joints])
         self._fast = TimeParametrization(eased(arm.joints, FAST))
-        self._slow = TimeParametrization(eased(arm.joints, min(CREEP, SPEED_M_S / fastest)))
+        self._slow = TimeParametrization(eased(arm.joints, min(CREEP, MAX_SPEED_M_S / fastest)))
         self._creep = TimeParametrization(eased(arm.joints, CREEP))
 
     def press(
@@ -66,14 +66,14 @@ class PressPlanner:
         others: Sequence[Thing],
         posture: Floats,
     ) -> PressWay | NoWay:
-        """Return how to press, or why it cannot be done.
+        """Plan a press, or return why it is impossible.
 
         Args:
-            target: A place (3,) [m], or a thing whose near side is meant.
-            approaches: Directions (3,) in which the tool may come, the best first.
-            depth: How far it goes on behind the place at most [m].
-            others: What is around.
-            posture: Where the arm is (n,).
+            target: A place (3,) [m], or a thing whose near side is pressed.
+            approaches: Directions (3,) of the tool's motion, the best first.
+            depth: Largest motion beyond the place [m].
+            others: Other things around.
+            posture: Present posture (n,).
         """
         thing = target if isinstance(target, Thing) else None
         solids = [*([thing] if thing else []), *others]
@@ -88,7 +88,7 @@ class PressPlanner:
             point = target if not isinstance(target, Thing) else near_side(target, approach)
             line = self._line(along, point, approach, depth, posture)
             if isinstance(line, NoWay):
-                fault = fault if number else line  # of the best one
+                fault = fault if number else line  # the fault of the best approach
                 continue
             way = plan(around, posture, line[0])
             if isinstance(way, NoPath):
@@ -106,7 +106,7 @@ class PressPlanner:
         return fault
 
     def back(self, posture: Floats, before: Floats, seconds: float = 0.0) -> tuple[Phase, ...]:
-        """Return how to go back from where something is pressed, after holding it for a while."""
+        """Plan to keep the posture of a press for some `seconds`, and then to go back."""
         away = self._creep.trajectory(np.stack((posture, before)))
         retreat = Phase(name="retreat", arm=away)
         return (Phase(name="hold", arm=self._still(posture, seconds)), retreat)
@@ -119,20 +119,20 @@ class PressPlanner:
         depth: float,
         posture: Floats,
     ) -> Floats | NoWay:
-        """Return postures (k, n) along the approach, at least to the place itself."""
+        """Return postures (k, n) along the approach, at least up to the place."""
         ends = np.arange(-RUN_IN_M, STEP_M / 2, STEP_M), np.arange(STEP_M, depth, STEP_M), [depth]
         found: list[Floats] = []
         for far in np.concatenate(ends):
             goal = ToolGoal(
                 position=point + far * approach, approach=approach, orientation_tolerance=TILT_RAD
             )
-            tries = {} if not found else {"tries": 0}  # it goes on from the posture before
+            tries = {} if not found else {"tries": 0}  # continue from the previous posture only
             one = self._inverse.solve(
                 goal, found[-1] if found else posture, checker.touches, **tries
             )
             if isinstance(one, OutOfReach):
                 fault = one.reason
-            elif found and np.abs(one.posture - found[-1]).max() > JUMP_RAD:
+            elif found and np.abs(one.posture - found[-1]).max() > MAX_JUMP:
                 fault = "the way to it is not straight"
             else:
                 found.append(one.posture)
@@ -151,7 +151,7 @@ class PressPlanner:
 
 
 def near_side(thing: Thing, approach: Floats) -> Floats:
-    """Return where a ray along `approach` (3,) to the middle of a thing enters it (3,) [m]."""
+    """Return the point (3,) [m] where a ray along `approach` (3,) to a thing's middle enters it."""
     along = np.abs(thing.axes.T @ approach)
     if thing.kind == "sphere":
         way = thing.size[0]
