@@ -98,10 +98,10 @@ def measure_barn(
 ) -> BarnResult:
     """Drive `trials` times in each of `worlds`, in `jobs` processes.
 
-    With the robot's own `nodes`, or only with the functions that they call.
+    The robot runs its own `nodes`, or only the functions that they call.
     """
     drive = drive_nodes if nodes else drive_functions
-    done = []
+    trials_done = []
     context = get_context("spawn")
     with ProcessPoolExecutor(jobs, context, initializer=end_on_interrupt) as pool:
         waiting = [
@@ -111,12 +111,12 @@ def measure_barn(
         ]
         try:
             for one in as_completed(waiting):
-                done.append(one.result())
-                progress(done[-1])
+                trials_done.append(one.result())
+                progress(trials_done[-1])
         finally:
-            pool.shutdown(cancel_futures=True)  # a failure does not wait for the others
-    done.sort(key=lambda one: (one.world, one.trial))
-    return BarnResult(plant=PLANTS[plant], samples=samples, trials=tuple(done))
+            pool.shutdown(cancel_futures=True)  # after a failure, do not run the others
+    trials_done.sort(key=lambda one: (one.world, one.trial))
+    return BarnResult(plant=PLANTS[plant], samples=samples, trials=tuple(trials_done))
 
 
 def _when_warm(drive: Callable[..., BarnTrial], *arguments: object) -> BarnTrial:
@@ -126,13 +126,13 @@ def _when_warm(drive: Callable[..., BarnTrial], *arguments: object) -> BarnTrial
 
 @functools.cache
 def _warm_up() -> None:
-    """Compile and freeze existing objects, as a robot's process does before it drives."""
+    """Compile kernels and freeze existing objects, as a robot's process does before it drives."""
     warm_up_local_planner(JACKAL)
     gc.collect()
     gc.freeze()
 
 
-WAKING_TICKS = 500  # until the gate is open and the robot knows where it is
+START_TIMEOUT_TICKS = 500  # until the robot is enabled and localized
 
 
 class JudgedCourse(BarnCourse):
@@ -153,7 +153,7 @@ def drive_nodes(world: BarnWorld, trial: int, conditions: Conditions, samples: i
 
 async def _drive(course: JudgedCourse, samples: int, folder: str) -> BarnTrial:
     async with InMemoryRobot(_nodes(course, samples, folder)) as robot:
-        await _until_awake(robot)
+        await _until_ready(robot)
         goal = GoalRequest(x=course.goal.x, y=course.goal.y, source="bench")
         (reply,) = await robot.ask(GOAL, goal)
         if not reply.ok:
@@ -165,15 +165,17 @@ async def _drive(course: JudgedCourse, samples: int, folder: str) -> BarnTrial:
 
 def _nodes(course: JudgedCourse, samples: int, folder: str) -> dict[str, Node]:
     """Return the nodes of a robot that may drive through unknown space."""
-    mapping = PerceptionConfig(mapping="slam", compile_first=True)  # fake time waits for nothing
-    anywhere = DecisionConfig(
+    mapping = PerceptionConfig(
+        mapping="slam", compile_first=True
+    )  # fake time does not wait for a compiler
+    through_unknown = DecisionConfig(
         behaviour="navigate",
         settings={"unknown_space": "allow", "samples": samples},
         compile_first=True,
     )
     return {
         "perception": functools.partial(perception.run, mapping),
-        "decision": functools.partial(decision.run, anywhere),
+        "decision": functools.partial(decision.run, through_unknown),
         "control": control.run,
         "safety": _safety,
         "driver": node_of(JACKAL, course, folder),
@@ -185,20 +187,20 @@ async def _safety(bus: Bus, ready: Callable[[], None]) -> None:
     await safety.run(bus, ready, lambda _now_ns: Host())
 
 
-async def _until_awake(robot: InMemoryRobot) -> None:
-    """Wait until the robot is localized and enabled. Raises Refused when it never is."""
-    states, places = robot.operator.latest(STATE), robot.operator.latest(POSE)
+async def _until_ready(robot: InMemoryRobot) -> None:
+    """Wait until the robot is localized and enabled. Raises Refused after a timeout."""
+    states, poses = robot.operator.latest(STATE), robot.operator.latest(POSE)
     maps = robot.operator.latest(MAP)
-    for _ in range(WAKING_TICKS):
+    for _ in range(START_TIMEOUT_TICKS):
         await robot.tick()
-        state, place = states.current, places.current
-        if state and state.gate.mode == "enabled" and (place and place.localized) and maps.current:
+        state, pose = states.current, poses.current
+        if state and state.gate.mode == "enabled" and (pose and pose.localized) and maps.current:
             return
     raise Refused("the robot was not enabled and localized in time")
 
 
 BOOT = 1
-SENT_TICKS = 30  # of commands, that planning looks back on
+SENT_TICKS = 30  # age of the oldest command that planning uses
 DRIVING = GateStatus(mode="enabled", commander=BRAIN, enables=1)
 
 
@@ -229,7 +231,7 @@ class BarnBrain:
         return command
 
     def _decide(self, state: RobotState, world: WorldModel) -> Intent:
-        began = time.thread_time()
+        begin_s = time.thread_time()
         sent = self._response.sent(state.tick - SENT_TICKS, state.tick - 1)
         request = PlanRequest(
             tick=state.tick,
@@ -242,7 +244,7 @@ class BarnBrain:
             sent=tuple(SentCommand(tick, velocity) for tick, velocity in sent),
         )
         plan = self._planner.plan(request)
-        self.cycles_ms.append((time.thread_time() - began) * 1e3)
+        self.cycles_ms.append((time.thread_time() - begin_s) * 1e3)
         return Intent(
             twist=plan.twist,
             trajectory=plan.trajectory,
@@ -257,7 +259,7 @@ class BarnBrain:
 def drive_functions(
     world: BarnWorld, trial: int, conditions: Conditions, samples: int
 ) -> BarnTrial:
-    """Drive one trial with the nodes; equal arguments give equal results."""
+    """Drive one trial without nodes; equal arguments give equal results."""
     course = BarnCourse(world, trial, conditions)
     brain = BarnBrain(course.goal, LocalSettings(samples=samples))
     limits, output = limits_of(JACKAL), ZERO

@@ -25,8 +25,8 @@ from gigabrain_zenoh.geometry.limits import ZERO
 from gigabrain_zenoh.geometry.pose import to_frame
 from gigabrain_zenoh.kernels.jit import kernel
 
-SUBSTEPS = 4  # of a tick
-ACCELERATION, ANGULAR_ACCELERATION = 5.0, 20.0  # [m/s2], [rad/s2], what the floor takes
+SUBSTEPS = 4  # per tick
+ACCELERATION, ANGULAR_ACCELERATION = 5.0, 20.0  # [m/s2], [rad/s2], by the floor's friction
 LENGTH_M, WIDTH_M = 0.458, 0.416  # [m], of chassis and wheels
 FIELD_OF_VIEW_RAD = math.radians(270.0)
 
@@ -46,32 +46,32 @@ JACKAL = BodyDescription(
     max_linear_deceleration=ACCELERATION,
     max_angular_acceleration=ANGULAR_ACCELERATION,
     lidar=LIDAR,
-    # reaction: the time to the next scan, a tick on the bus, the hard plant's delay and most of its
-    # lag, which matters less at low speed. A stop from 2 m/s in a turn begins after up to 0.65 s.
-    # Its speed follows by the hard plant's delay and lag when all is well.
+    # reaction_time: until the next scan, one tick on the bus, the hard plant's delay, and most of
+    # its lag, which matters less at low speed. A stop from 2 m/s in a turn begins after at most
+    # 0.65 s. response: the hard plant's delay and lag.
     thresholds=Thresholds(reaction_time=0.26, follow_sustain=0.5, response=0.25),
 )
 
 
-DYNAMIC_LENGTH = 20.0  # [m], of every path in DynaBARN
-PATH_CELL, PATH_X, PATH_Y = 0.15, -4.575, 5.075  # [m], from a cell of the path to the world
-SCAN_TICKS = 2  # from scan to scan
+DYNAMIC_LENGTH = 20.0  # [m], of each path in DynaBARN
+PATH_CELL, PATH_X, PATH_Y = 0.15, -4.575, 5.075  # [m], size and origin of a path's cells
+SCAN_TICKS = 2  # between scans
 MAX_TRIAL_S = 100.0
-REACHED_M, BEGUN_M = 1.0, 0.1  # [m], from the goal and from the start
-APART_S = 7.3  # between the times at which trials of a moving world begin
+REACHED_M, BEGUN_M = 1.0, 0.1  # distance from the goal, and from the start
+TRIAL_OFFSET_S = 7.3  # of a moving world's time, from trial to trial
 SEED = 1000
 
 
 class Conditions(Struct, frozen=True, kw_only=True):
     """Faults of the plant."""
 
-    delay: float = 0.1  # [s], before a command has any effect
+    delay: float = 0.1  # [s], until a command has an effect
     lag: float = 0.15  # [s], time constant
-    slip: float = 0.6  # least share of the commanded yaw rate that is reached
-    drift: float = 0.02  # share of odometry's error, in distance and in angle
+    slip: float = 0.6  # smallest share of the commanded yaw rate that may be reached
+    drift: float = 0.02  # largest relative error of odometry, in distance and in angle
     noise: float = 0.03  # [m], standard deviation of a range
-    dropouts: float = 0.1  # share of the beams that see nothing
-    physics: bool = False  # MuJoCo's, which determines slip and acceleration
+    dropouts: float = 0.1  # share of the beams without a reading
+    physics: bool = False  # with MuJoCo, which determines slip and acceleration
 
 
 HARD = Conditions()
@@ -125,7 +125,7 @@ class JackalBody(abc.ABC):
 
 
 class KinematicJackal(JackalBody):
-    """A body that moves by kinematics alone."""
+    """A body without physics: it follows its kinematics."""
 
     def __init__(
         self, conditions: Conditions, start: tuple[float, float, float], seed: int
@@ -144,11 +144,11 @@ class KinematicJackal(JackalBody):
 
     def _substep(self, command: Velocity, dt: float) -> None:
         share = self._lag_share(dt)
-        most, turning = ACCELERATION * dt, ANGULAR_ACCELERATION * dt
+        max_change, max_angular_change = ACCELERATION * dt, ANGULAR_ACCELERATION * dt
         change = share * (command.linear_x - self.v)
-        self.v += max(-most, min(most, change))
+        self.v += max(-max_change, min(max_change, change))
         change = share * (self._gain * command.angular_z - self.w)
-        self.w += max(-turning, min(turning, change))
+        self.w += max(-max_angular_change, min(max_angular_change, change))
         middle = self.yaw + 0.5 * self.w * dt
         self.x += self.v * math.cos(middle) * dt
         self.y += self.v * math.sin(middle) * dt
@@ -176,7 +176,7 @@ class KinematicJackal(JackalBody):
 
 
 def _to_polygon(corners: Floats, points: Floats) -> Floats:
-    """Return the distances [m] of `points` (n, 2) from a convex polygon, which is 0 inside."""
+    """Return the distances [m] of `points` (n, 2) from a convex polygon; 0 inside."""
     along = np.roll(corners, -1, axis=0) - corners
     off = points[:, None, :] - corners
     share = np.clip((off * along).sum(-1) / (along * along).sum(-1), 0.0, 1.0)
@@ -261,10 +261,10 @@ def _read_static(file: Path) -> list[BarnWorld]:
     posts = np.split(data["cyl"].astype(np.float64), np.cumsum(data["n_cyl"])[:-1])
     cells = np.split(data["path_cells"], np.cumsum(data["n_path"])[:-1])
     worlds = []
-    for index, mine, path in zip(data["index"].tolist(), posts, cells, strict=True):
+    for index, own_posts, path in zip(data["index"].tolist(), posts, cells, strict=True):
         points = np.vstack([start[:2], path * PATH_CELL + (PATH_X, PATH_Y), goal])
         length = float(np.hypot(*np.diff(points, axis=0).T).sum())
-        worlds.append(BarnWorld(index, mine, (), start, goal, length))
+        worlds.append(BarnWorld(index, own_posts, (), start, goal, length))
     return worlds
 
 
@@ -284,7 +284,7 @@ def _read_dynamic(file: Path) -> list[BarnWorld]:
 
 
 def choose_worlds(worlds: list[BarnWorld], only: str) -> list[BarnWorld]:
-    """Return the worlds whose numbers are in `only`, separated by commas. Default: all."""
+    """Return the worlds whose numbers are in `only`, separated by commas; all if it is empty."""
     if not only:
         return worlds
     known = {world.number: world for world in worlds}
@@ -303,19 +303,19 @@ class BarnTrial(Struct, frozen=True, kw_only=True):
     world: int
     trial: int
     result: str  # success, collision or timeout
-    seconds: float  # since it left the start
+    seconds: float  # since the robot left the start
     least_clearance: float  # [m], over all ticks
     score: float  # by the rules of 2024 and later, 0.5 at most
-    cycles_ms: tuple[float, ...]  # of planning, as long as this thread worked
+    cycles_ms: tuple[float, ...]  # CPU time of each plan
 
 
 class BarnCourse:
-    """A trial under way. Equal arguments and commands give equal readings."""
+    """A running trial. Equal arguments and commands give equal readings."""
 
     def __init__(self, world: BarnWorld, trial: int, conditions: Conditions) -> None:
         self._world, self._trial = world, trial
         self._body = body_in(world, conditions, SEED * world.number + trial)
-        self._least, self._begun = math.inf, 0
+        self._least_clearance, self._begun = math.inf, 0
         self.tick, self.result = 0, ""
         self._discs = world.posts
 
@@ -330,11 +330,11 @@ class BarnCourse:
         """Begin a tick, and judge the trial."""
         self.tick += 1
         body, world = self._body, self._world
-        self._discs = world.discs(APART_S * self._trial + self.tick * TICK_S)
-        self._least = min(self._least, body.clearance(self._discs))
+        self._discs = world.discs(TRIAL_OFFSET_S * self._trial + self.tick * TICK_S)
+        self._least_clearance = min(self._least_clearance, body.clearance(self._discs))
         if not self._begun and math.dist((body.x, body.y), world.start[:2]) > BEGUN_M:
             self._begun = self.tick
-        if self._least <= 0.0:
+        if self._least_clearance <= 0.0:
             self.result = "collision"
         elif math.dist((body.x, body.y), world.goal) < REACHED_M:
             self.result = "success"
@@ -342,7 +342,7 @@ class BarnCourse:
             self.result = "timeout"
 
     def state(self) -> RobotState:
-        """Return the body's state, as measured."""
+        """Return the body's state as it measures it, with drift."""
         return RobotState(
             robot_type=JACKAL.robot_type, pose=self._body.odometry, velocity=self._body.velocity
         )
@@ -365,15 +365,15 @@ class BarnCourse:
 
     def ended(self, cycles_ms: tuple[float, ...] = ()) -> BarnTrial:
         """Return the result."""
-        best = self._world.length / 2.0
-        clipped = min(max(self._seconds, 2 * best), 8 * best)
+        best_s = self._world.length / 2.0
+        clipped_s = min(max(self._seconds, 2 * best_s), 8 * best_s)
         return BarnTrial(
             world=self._world.number,
             trial=self._trial,
             result=self.result,
             seconds=self._seconds,
-            least_clearance=self._least,
-            score=(self.result == "success") * best / clipped,
+            least_clearance=self._least_clearance,
+            score=(self.result == "success") * best_s / clipped_s,
             cycles_ms=cycles_ms,
         )
 
@@ -383,7 +383,7 @@ class BarnCourse:
 
 
 def body_in(world: BarnWorld, conditions: Conditions, seed: int) -> JackalBody:
-    """Return the Jackal at the start of a world. Raises ConfigError without a simulator."""
+    """Return the Jackal at the start of a world. Raises ConfigError if MuJoCo is missing."""
     if not conditions.physics:
         return KinematicJackal(conditions, world.start, seed)
     try:

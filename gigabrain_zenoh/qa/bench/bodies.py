@@ -1,4 +1,4 @@
-"""`gigabrain bench bodies`: one brain, not restarted or reconfigured, drives all bodies in turn."""
+"""`gigabrain bench bodies`: one brain drives all bodies in turn, without a restart."""
 
 import asyncio
 import dataclasses
@@ -24,32 +24,32 @@ from gigabrain_zenoh.qa.robot_under_test import ProcessGroup, client
 from gigabrain_zenoh.runtime.managed_process import ProcessSpec
 from gigabrain_zenoh.ui.run_report import RunMonitor
 
-BODY = ("emulator", "driver")  # the processes that are exchanged; the others stay
+BODY = ("emulator", "driver")  # processes that are replaced for each body; the others stay
 POLL_S = 0.05
-START_S = 60.0  # until a body is enabled, on a busy machine
-STALL_S = 20.0
+START_TIMEOUT_S = 60.0  # until a body is enabled, on a busy machine
+STALL_TIMEOUT_S = 20.0
 MOTION = (("linear_x", 0.05), ("angular_z", 0.2))  # least speed that counts as motion
 
 
 class BodyFigures(Struct, frozen=True, kw_only=True):
-    """The figures of one body with the brain."""
+    """The figures of one body."""
 
     body: str
     seconds: float  # of the robot's time, while enabled
-    contacts: int | None  # the simulation's truth, as are the next two
+    contacts: int | None  # true value of the simulation, like the next two
     distance_m: float | None
     min_clearance_m: float | None
-    commanded: float  # [m/s], mean of the speed forward
+    commanded: float  # [m/s], mean forward speed
     measured: float  # [m/s]
-    latency_ticks: float | None  # median from a command of motion to the motion measured
-    motions: int  # over which this median is taken
+    latency_ticks: float | None  # median, from a command to move to measured motion
+    motions: int  # number of latencies
     reconnects: int
-    stops: int  # number of times that the gate was shut
+    stops: int  # how often the gate was shut
     driver_cpu: float | None  # [%] of a core; includes a body that the driver simulates
 
 
 class BodiesResult(Struct, frozen=True, kw_only=True):
-    """All bodies, and whether it really was the same brain."""
+    """The figures of all bodies, and the process ids and restarts of the brain."""
 
     link: LinkName
     world: str
@@ -60,7 +60,7 @@ class BodiesResult(Struct, frozen=True, kw_only=True):
 
     @property
     def ok(self) -> bool:
-        """True without contact and without a restart in the brain."""
+        """True without a contact or a restart of the brain."""
         return self.brain_restarts == 0 and all(body.contacts == 0 for body in self.bodies)
 
 
@@ -73,13 +73,13 @@ async def measure_bodies(
 ) -> BodiesResult:
     """Drive each body for `seconds` of its time. Raises GigabrainError.
 
-    `deployment` holds all settings but the body.
+    `deployment` has all settings except the body.
     """
     deployment = with_free_port(deployment)
     specs = process_specs(deployment, "robot", folder / "brain", folder / "state")
     brain_specs = [spec for spec in specs if spec.name not in BODY]
     async with ProcessGroup(brain_specs, strict=False) as brain:
-        await brain.until_ready(START_S)
+        await brain.until_ready(START_TIMEOUT_S)
         pids = brain.pids
         figures = []
         for name in names:
@@ -120,14 +120,14 @@ async def _drive(
 
 
 def _independent(spec: ProcessSpec) -> ProcessSpec:
-    """Return the same process, without waiting for those of another supervisor."""
+    """Return the same process, without dependencies on those of another supervisor."""
     return dataclasses.replace(spec, after=tuple(name for name in spec.after if name in BODY))
 
 
 async def _until_driven(
     motion: "MotionProbe", seconds: float, body: ProcessGroup, brain: ProcessGroup
 ) -> None:
-    """Wait until the gate has been open for `seconds`. Raises BodyLost when it stalls."""
+    """Wait until the gate was open for `seconds`. Raises BodyLost when the robot stalls."""
     loop = asyncio.get_running_loop()
     seen, seen_s = motion.enabled_ticks, loop.time()
     while motion.enabled_ticks * TICK_S < seconds:
@@ -136,10 +136,10 @@ async def _until_driven(
             raise BodyLost(f"{', '.join(given_up)} does not run")
         if motion.enabled_ticks != seen:
             seen, seen_s = motion.enabled_ticks, loop.time()
-        elif loop.time() - seen_s > (STALL_S if seen else START_S):
+        elif loop.time() - seen_s > (STALL_TIMEOUT_S if seen else START_TIMEOUT_S):
             gate = motion.state.gate if motion.state else None
-            why = f"its gate is {gate.mode} {in_words(gate.causes)}" if gate else "no robot/state"
-            raise BodyLost(f"the robot has stalled: {why.strip()}")
+            cause = f"its gate is {gate.mode} {in_words(gate.causes)}" if gate else "no robot/state"
+            raise BodyLost(f"the robot has stalled: {cause.strip()}")
 
 
 def _figures(
@@ -149,7 +149,7 @@ def _figures(
         value = truth.get(name)
         return float(value) if isinstance(value, int | float) else None
 
-    contacts, late, cpu = number("contacts"), motion.latencies, motion.driver_cpu
+    contacts, latencies, cpu = number("contacts"), motion.latencies, motion.driver_cpu
     return BodyFigures(
         body=Path(body).stem if body.endswith((".yaml", ".yml")) else body,
         seconds=round(motion.enabled_ticks * TICK_S, 2),
@@ -158,8 +158,8 @@ def _figures(
         min_clearance_m=number("min_clearance_m"),
         commanded=round(_mean(motion.commanded), 4),
         measured=round(_mean(motion.measured), 4),
-        latency_ticks=statistics.median(late) if late else None,
-        motions=len(late),
+        latency_ticks=statistics.median(latencies) if latencies else None,
+        motions=len(latencies),
         reconnects=motion.state.link.reconnects if motion.state else 0,
         stops=motion.stops,
         driver_cpu=round(100 * statistics.fmean(cpu), 1) if cpu else None,
@@ -177,11 +177,11 @@ class MotionProbe:
         self.enabled_ticks = self.stops = 0
         self.state: RobotState | None = None
         self.latencies: list[int] = []
-        self.driver_cpu: list[float] = []  # of a core, each second
+        self.driver_cpu: list[float] = []  # share of a core, once a second
         self.commanded: list[float] = []  # [m/s], forward
         self.measured: list[float] = []
         self._command: CmdVel | None = None
-        self._begun: dict[str, int | None] = {}  # tick of a command of motion not yet followed
+        self._begun: dict[str, int | None] = {}  # tick of a command to move, until it is followed
         self._was_moving: dict[str, bool] = {}
         self._open = False
         bus.subscribe(STATE, self._on_state)
@@ -194,10 +194,10 @@ class MotionProbe:
 
     def _on_command(self, _key: str, command: CmdVel) -> None:
         self._command = command
-        for axis, level in MOTION:
-            moves = abs(getattr(command, axis)) >= level
+        for axis, min_speed in MOTION:
+            moves = abs(getattr(command, axis)) >= min_speed
             if moves and not self._was_moving.get(axis, False):
-                self._begun[axis] = None if self._moves(axis, level) else command.tick
+                self._begun[axis] = None if self._moves(axis, min_speed) else command.tick
             elif not moves:
                 self._begun[axis] = None
             self._was_moving[axis] = moves
@@ -212,11 +212,11 @@ class MotionProbe:
         self.enabled_ticks += 1
         self.commanded.append(self._command.linear_x)
         self.measured.append(state.velocity.linear_x)
-        for axis, level in MOTION:
+        for axis, min_speed in MOTION:
             begun = self._begun.get(axis)
-            if begun is not None and self._moves(axis, level):
+            if begun is not None and self._moves(axis, min_speed):
                 self.latencies.append(state.tick - begun)
                 self._begun[axis] = None
 
-    def _moves(self, axis: str, level: float) -> bool:
-        return self.state is not None and abs(getattr(self.state.velocity, axis)) >= level
+    def _moves(self, axis: str, min_speed: float) -> bool:
+        return self.state is not None and abs(getattr(self.state.velocity, axis)) >= min_speed

@@ -1,4 +1,4 @@
-"""`gigabrain bench cameras`: what cameras cost a whole robot, and when their contours are known."""
+"""`gigabrain bench cameras`: CPU and memory of a robot's cameras, and latency of contours."""
 
 import statistics
 from collections import defaultdict
@@ -27,7 +27,7 @@ from gigabrain_zenoh.qa.robot_under_test import (
 if TYPE_CHECKING:
     from rich.table import Table
 
-SETTLE_S = 3.0  # imports and first calls are no part of what a running robot costs
+SETTLE_S = 3.0  # imports and first calls do not count
 MB = 1e6
 CAMERA = "camera"
 
@@ -35,35 +35,35 @@ CAMERA = "camera"
 class RobotCost(Struct, frozen=True, kw_only=True):
     """CPU and memory of the processes of one robot, by name."""
 
-    cpu: Mapping[str, float]  # of one core, mean
-    pss_bytes: Mapping[str, int]  # memory, that of shared pages divided by those who share it
+    cpu: Mapping[str, float]  # mean share of one core
+    pss_bytes: Mapping[str, int]  # memory; shared pages are divided by the number of users
 
 
 class CameraCost(Struct, frozen=True, kw_only=True):
-    """A robot without its cameras and with them."""
+    """Costs of a robot without and with cameras."""
 
     body: str
     world: str
     seconds: float
     without: RobotCost
     cameras: RobotCost
-    rendering_cpu: float  # of one core, within the process `camera`
+    rendering_cpu: float  # share of one core, within the process `camera`
     latency_ms: tuple[float, ...]  # from each exposure to a world with its contours
 
     @property
     def added_cpu(self) -> float:
-        """CPU that cameras and vision add, beside rendering, of one core."""
-        with_all, before = sum(self.cameras.cpu.values()), sum(self.without.cpu.values())
-        return with_all - before - self.rendering_cpu
+        """CPU that cameras and vision add, without rendering, as a share of one core."""
+        with_cameras, without = sum(self.cameras.cpu.values()), sum(self.without.cpu.values())
+        return with_cameras - without - self.rendering_cpu
 
     @property
     def added_pss_bytes(self) -> int:
-        """Memory that cameras and vision add."""
+        """Memory that cameras and vision add [bytes]."""
         return sum(self.cameras.pss_bytes.values()) - sum(self.without.pss_bytes.values())
 
 
 class Latencies:
-    """Times each depth picture until a world has its contours, by Unix time."""
+    """Measures the time from each depth image to a world with its contours, by Unix time."""
 
     def __init__(self, bus: Bus) -> None:
         self._bus = bus
@@ -85,7 +85,7 @@ class Latencies:
 async def measure_cameras(
     body: str, world: str, seconds: float, show: Callable[[str], None]
 ) -> CameraCost:
-    """Run a robot that avoids obstacles, without cameras and with them.
+    """Run a robot that avoids obstacles, first without and then with cameras.
 
     Raises ConfigError for a body without cameras, and GigabrainError when a process dies.
     """
@@ -117,13 +117,13 @@ async def measure_cameras(
 
 
 async def _rendered_s(bus: Bus) -> float:
-    """Return the CPU time that rendering has taken [s]."""
+    """Return the CPU time of rendering so far [s]."""
     return float(str((await report_of(bus, CAMERA)).get("render_cpu_s") or 0.0))
 
 
 async def _cost(group: ProcessGroup, bus: Bus, seconds: float) -> RobotCost:
     shares: defaultdict[str, list[float]] = defaultdict(list)
-    close = bus.subscribe(HEALTH, lambda _, health: _note(shares, health))
+    close = bus.subscribe(HEALTH, lambda _, health: _add_cpu(shares, health))
     await group.run_for(seconds)
     close()
     return RobotCost(
@@ -132,19 +132,19 @@ async def _cost(group: ProcessGroup, bus: Bus, seconds: float) -> RobotCost:
     )
 
 
-def _note(shares: defaultdict[str, list[float]], health: Health) -> None:
+def _add_cpu(shares: defaultdict[str, list[float]], health: Health) -> None:
     shares[health.process].append(health.cpu)
 
 
 def pss_of(pid: int) -> int:
-    """Return the memory of a process [bytes], that of shared pages divided. Linux only."""
+    """Return the proportional set size of a process [bytes]. Linux only."""
     rollup = Path(f"/proc/{pid}/smaps_rollup").read_text()
     line = next(line for line in rollup.splitlines() if line.startswith("Pss:"))
     return 1024 * int(line.split()[1])
 
 
 def cameras_table(result: CameraCost) -> "Table":
-    """Return what `gigabrain bench cameras` prints."""
+    """Return the table that `gigabrain bench cameras` prints."""
     table = table_of("", "CPU without", "CPU with", "PSS without", "PSS with")
     for name in result.cameras.pss_bytes:
         table.add_row(

@@ -1,4 +1,4 @@
-"""`gigabrain bench chain`: scan to command beside a bare relay, and the cost of each hop."""
+"""`gigabrain bench chain`: latency from scan to command, next to a bare relay, and per hop."""
 
 import asyncio
 import statistics
@@ -49,23 +49,23 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 Progress = Callable[[str], None]
-MAX_P50_RATIO, MAX_P99_RATIO = 1.5, 2.0  # of the bare relay's
+MAX_P50_RATIO, MAX_P99_RATIO = 1.5, 2.0  # of our latency to the bare relay's
 LISTEN_S = 4.0
-SETTLE_S = 1.0  # of the relay; the chain counts from when the gate opens
-LATE_S = 20.0  # how much longer than announced a relay may take
+SETTLE_S = 1.0  # of the relay; the chain is measured from the opening of the gate
+LATE_S = 20.0  # tolerated delay of a relay's figures
 RELAY = (sys.executable, "-P", "-m", "gigabrain_zenoh.qa.bench.relay")
 KEYS = ("bench/scan", "bench/world", "bench/intent", "bench/cmd")
 NAMES = ("source", "first", "second", "third")
 STANDS_FOR = ("driver", "perception", "decision", "control")
 ROUTER_ONLY = Deployment(hosts={"robot": ("router",)}, router=LOOPBACK)
 TURNS = 100
-# A process that has slept finds its code in no cache: a second call within a millisecond costs a
-# fifth of the first. So each turn sleeps as long as a process does between two ticks.
+# After a sleep, a process's code is in no cache: a second call within a millisecond takes a fifth
+# of the first one's time. So each turn sleeps for a tick, like a process.
 PAUSE_S = TICK_NS / 1e9
 
 
 class RateComparison(Struct, frozen=True, kw_only=True):
-    """Rounds of chain, relays and frameworks in turns at one rate, and one without a router."""
+    """Rounds of chain, relay and frameworks in turns at one rate; a relay without a router."""
 
     rate_hz: float
     chain: tuple[Latencies, ...]
@@ -75,24 +75,24 @@ class RateComparison(Struct, frozen=True, kw_only=True):
 
     @property
     def ratio_p50(self) -> float:
-        """Ours over the bare relay's."""
+        """Our median latency over the bare relay's."""
         return over_rounds(self.chain).p50_ms / over_rounds(self.relay).p50_ms
 
     @property
     def ratio_p99(self) -> float:
-        """Ours over the bare relay's."""
+        """Our 99th percentile over the bare relay's."""
         return over_rounds(self.chain).p99_ms / over_rounds(self.relay).p99_ms
 
 
 class Hop(Struct, frozen=True, kw_only=True):
-    """One hop, from a message's departure to the next one's [ms, medians]."""
+    """Medians of one hop [ms], from publishing a message to publishing the next one."""
 
     name: str  # "scan → world"
     took: float  # in the running chain
     put: float  # filling in the header, encoding, and Zenoh's put
     bridge: float  # from Zenoh's thread to the event loop
     decode: float
-    step: float  # the node's work; 0 at the driver, where the clock is stopped
+    step: float  # the node's step; 0 in the driver, where the measurement ends
 
     @property
     def rest(self) -> float:
@@ -101,12 +101,12 @@ class Hop(Struct, frozen=True, kw_only=True):
 
 
 class ChainResult(Struct, frozen=True, kw_only=True):
-    """Figures of the whole benchmark."""
+    """Results of the whole benchmark."""
 
     seconds: float  # of each run
     payload_bytes: tuple[int, ...]  # scan, world, intent, command
     rates: tuple[RateComparison, ...]
-    overheard: Latencies  # the chain with a subscriber on every hop, which the hops add up to
+    overheard: Latencies  # the chain with a subscriber on every hop; the sum of the hops
     hops: tuple[Hop, ...]
 
 
@@ -117,7 +117,7 @@ async def measure_chain(
     show: Progress,
     frameworks: Sequence[Framework] = (),
 ) -> ChainResult:
-    """Run the benchmark, with relays of other frameworks. Raises GigabrainError if one dies."""
+    """Run the benchmark, with relays of `frameworks`. Raises GigabrainError if a process dies."""
     with tempfile.TemporaryDirectory(prefix="gigabrain-bench-") as name:
         folder = Path(name)
         show(f"listening to the chain at {rates_hz[0]:g} Hz")
@@ -170,9 +170,9 @@ async def _compare(
 
 @asynccontextmanager
 async def brain(rate_hz: float, folder: Path) -> AsyncIterator[tuple[ProcessGroup, Bus]]:
-    """Run our processes as `gigabrain up` does, from the moment when the gate is open.
+    """Run our processes as `gigabrain up` does; yield when the gate is open.
 
-    Safety is no part of the chain, but without it the gate does not open.
+    Safety is not part of the chain, but without it the gate does not open.
     """
     deployment = Deployment(body=str(_mock_body(rate_hz, folder)), resume="auto", router=LOOPBACK)
     async with measured_robot(deployment, folder) as (group, bus):
@@ -182,7 +182,7 @@ async def brain(rate_hz: float, folder: Path) -> AsyncIterator[tuple[ProcessGrou
 
 
 def _mock_body(rate_hz: float, folder: Path) -> Path:
-    """Write the file of a body without physics whose lidar turns at this rate."""
+    """Write the file of a body without physics, with a lidar of this rate."""
     robot = yaml.safe_load(robot_path("mock").read_text(encoding="utf-8"))
     robot["lidar"]["rate_hz"] = rate_hz
     path = folder / "mock.yaml"
@@ -191,7 +191,7 @@ def _mock_body(rate_hz: float, folder: Path) -> Path:
 
 
 async def time_chain(rate_hz: float, seconds: float, folder: Path) -> Latencies:
-    """Measure scan to command, by the driver's clock."""
+    """Measure the latency from scan to command by the driver's clock."""
     async with brain(rate_hz, folder) as (group, bus):
         await group.run_for(seconds)
         return await _chain_latencies(bus)
@@ -217,7 +217,7 @@ async def _chain_latencies(bus: Bus) -> Latencies:
 async def time_relay(
     rate_hz: float, seconds: float, sizes: Sequence[int], folder: Path
 ) -> Latencies:
-    """Time four bare processes, joined by a router like ours."""
+    """Time four bare processes that are connected by a router like ours."""
     deployment = with_free_port(ROUTER_ONLY)
     router = process_specs(deployment, "robot", folder, folder / "state")
     endpoints = [client_endpoint(deployment)] * len(NAMES)
@@ -225,9 +225,9 @@ async def time_relay(
 
 
 async def time_peers(rate_hz: float, seconds: float, sizes: Sequence[int]) -> Latencies:
-    """Time four bare processes, joined directly: shows what the router costs."""
-    at = tuple(with_free_port(Deployment(router=LOOPBACK)).router for _ in NAMES)
-    endpoints = [Endpoint(listen=(at[i],), connect=at[:i]) for i in range(len(NAMES))]
+    """Time four bare processes that are connected directly: shows the cost of the router."""
+    addresses = tuple(with_free_port(Deployment(router=LOOPBACK)).router for _ in NAMES)
+    endpoints = [Endpoint(listen=(addresses[i],), connect=addresses[:i]) for i in range(len(NAMES))]
     return await _run_relay([], relay_roles(rate_hz, seconds, sizes, endpoints))
 
 
@@ -256,7 +256,7 @@ async def _run_relay(router: Sequence[ProcessSpec], roles: Sequence[RelayRole]) 
         ProcessSpec(name, (*RELAY, msgspec.json.encode(role).decode()), after)
         for name, role in zip(NAMES, roles, strict=True)
     ]
-    within_s = SETTLE_S + roles[0].seconds + LATE_S
+    timeout_s = SETTLE_S + roles[0].seconds + LATE_S
     async with ProcessGroup([*router, *specs]) as group:
         await group.until_ready()
         found: list[Any] = []
@@ -265,7 +265,7 @@ async def _run_relay(router: Sequence[ProcessSpec], roles: Sequence[RelayRole]) 
             found[:] = [one["figures"] for one in group.records if one.get("event") == "figures"]
             return bool(found)
 
-        await group.until(measured, "the relay's figures", within_s)
+        await group.until(measured, "the relay's figures", timeout_s)
         return msgspec.convert(found[0], Latencies)
 
 
@@ -276,38 +276,38 @@ class HopTimer:
         self._ms: defaultdict[str, list[float]] = defaultdict(list)
 
     def __call__(self, name: str, work: Callable[[], T]) -> T:
-        """Do `work` and note its duration; returns its result."""
+        """Call `work`, add its duration, and return its result."""
         begin = time.perf_counter_ns()
         result = work()
         self.add(name, time.perf_counter_ns() - begin)
         return result
 
     def add(self, name: str, duration_ns: int) -> None:
-        """Note a duration."""
+        """Add a duration [ns]."""
         self._ms[name].append(duration_ns / 1e6)
 
     def median(self, name: str) -> float:
-        """Return the median [ms]; 0 where there is no duration."""
+        """Return the median [ms]; 0 without durations."""
         return statistics.median(self._ms.get(name, (0.0,)))
 
 
 async def measure_hops(monitor: ChainMonitor, total: Latencies) -> list[Hop]:
-    """Time the work of each hop by itself, and set it against the time in the running chain."""
-    timed = HopTimer()
+    """Time the work of each hop alone, beside the hop's time in the running chain."""
+    timer = HopTimer()
     deployment = with_free_port(ROUTER_ONLY)
     async with (
         measured_robot(deployment) as (_, sender),
         client(client_endpoint(deployment)) as receiver,
     ):
-        for topic in HOPS:  # without a subscriber a message is not even sent
+        for topic in HOPS:  # without a subscriber, no message is sent
             receiver.subscribe(topic, lambda _key, _message: None)
-        await _take_turns(monitor, sender, timed)
-    await _time_bridge(timed)
-    return [_hop(monitor, total, timed, topic) for topic in HOPS]
+        await _take_turns(monitor, sender, timer)
+    await _time_bridge(timer)
+    return [_hop(monitor, total, timer, topic) for topic in HOPS]
 
 
-async def _take_turns(monitor: ChainMonitor, bus: Bus, timed: HopTimer) -> None:
-    """In each turn, do the work of all nodes for one scan."""
+async def _take_turns(monitor: ChainMonitor, bus: Bus, timer: HopTimer) -> None:
+    """Time the work of all nodes for one scan, in each turn."""
     first, loop = monitor.get(STATE).tick, DecisionLoop(DecisionConfig())
     payloads = {topic.key: codec.encode(monitor.get(topic)) for topic in HOPS}
     decoders = {topic.key: Codec(topic.type, topic.max_bytes).decode for topic in HOPS}
@@ -315,10 +315,10 @@ async def _take_turns(monitor: ChainMonitor, bus: Bus, timed: HopTimer) -> None:
         steps = _steps_at(tick, monitor, loop)
         await asyncio.sleep(PAUSE_S)
         for topic in HOPS:
-            timed(f"put {topic.key}", partial(bus.publish, topic, monitor.get(topic), basis=tick))
-            timed(f"decode {topic.key}", partial(decoders[topic.key], payloads[topic.key]))
+            timer(f"put {topic.key}", partial(bus.publish, topic, monitor.get(topic), basis=tick))
+            timer(f"decode {topic.key}", partial(decoders[topic.key], payloads[topic.key]))
             if topic.key in steps:
-                timed(f"step {topic.key}", steps[topic.key])
+                timer(f"step {topic.key}", steps[topic.key])
 
 
 def _steps_at(
@@ -337,12 +337,12 @@ def _steps_at(
     }
 
 
-async def _time_bridge(timed: HopTimer) -> None:
-    """Time the way from a thread like Zenoh's to the event loop."""
+async def _time_bridge(timer: HopTimer) -> None:
+    """Time the handover from a thread like Zenoh's to the event loop."""
     bridge = Bridge()
 
     def arrived(posted_ns: int) -> None:
-        timed.add("bridge", time.perf_counter_ns() - posted_ns)
+        timer.add("bridge", time.perf_counter_ns() - posted_ns)
 
     def post() -> None:
         for _ in range(TURNS):
@@ -354,8 +354,8 @@ async def _time_bridge(timed: HopTimer) -> None:
     bridge.close()
 
 
-def _hop(monitor: ChainMonitor, total: Latencies, timed: HopTimer, topic: Topic[Any]) -> Hop:
-    """Return the hop that begins with `topic`. The last ends where the driver stops its clock."""
+def _hop(monitor: ChainMonitor, total: Latencies, timer: HopTimer, topic: Topic[Any]) -> Hop:
+    """Return the hop that begins with `topic`. The last one ends in the driver."""
     after = HOPS[HOPS.index(topic) + 1] if topic is not HOPS[-1] else None
     took = (
         monitor.between(topic, after) if after else total.p50_ms - monitor.between(HOPS[0], topic)
@@ -363,10 +363,10 @@ def _hop(monitor: ChainMonitor, total: Latencies, timed: HopTimer, topic: Topic[
     return Hop(
         name=f"{_short(topic)} → {_short(after) if after else 'driver'}",
         took=took,
-        put=timed.median(f"put {topic.key}"),
-        bridge=timed.median("bridge"),
-        decode=timed.median(f"decode {topic.key}"),
-        step=timed.median(f"step {topic.key}"),
+        put=timer.median(f"put {topic.key}"),
+        bridge=timer.median("bridge"),
+        decode=timer.median(f"decode {topic.key}"),
+        step=timer.median(f"step {topic.key}"),
     )
 
 
@@ -375,7 +375,7 @@ def _short(topic: Topic[Any]) -> str:
 
 
 def chain_page(result: ChainResult) -> "Group":
-    """Return what `gigabrain bench chain` prints."""
+    """Return the page that `gigabrain bench chain` prints."""
     from rich.console import Group
     from rich.text import Text
 

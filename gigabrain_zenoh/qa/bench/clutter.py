@@ -36,13 +36,13 @@ from gigabrain_zenoh.qa.robot_under_test import (
     report_of,
 )
 
-START_S = 600.0  # a robot's processes and its first map, on a busy machine
-WAIT_S = 3.0  # that a tick may wait for the brain: less than a stuck process may take
-MAX_SILENCE_S = 120.0  # of the tasks, and of the driver
-SETTLED_S = 3.0  # after the first goal was sent
-REACHED_M = 0.3  # from a goal at rest, by the physics
-MIN_REACHED = 8  # goals of a world
-POLLS_PER_LOOK = 5  # at the truth
+START_TIMEOUT_S = 600.0  # for a robot's processes and its first map, on a busy machine
+LOCKSTEP_TIMEOUT_S = 3.0  # shorter than the timeout of a stuck process
+MAX_SILENCE_S = 120.0  # of the task queue and of the driver
+SETTLED_S = 3.0  # after the first goal; before, refused goals are sent again
+REACHED_M = 0.3  # from the goal, at rest, by the true pose
+MIN_REACHED = 8  # goals per world
+POLLS_PER_LOOK = 5  # polls of the processes per request of the true pose
 
 Progress = Callable[[str], None]
 T = TypeVar("T")
@@ -62,7 +62,7 @@ class Incident(Struct, frozen=True, kw_only=True):
     """A contact or a fall, by the physics."""
 
     what: str  # contact or fall
-    near: str  # kind of the nearest thing
+    near: str  # kind of the nearest object
     at: Pose  # in the world
     seconds: float  # since the first goal
 
@@ -71,14 +71,14 @@ class MissedGoal(Struct, frozen=True, kw_only=True):
     """A goal that was not reached."""
 
     number: int
-    at: Pose  # in the world, where the robot was then
+    at: Pose  # of the robot, in the world
     goal: Point  # in the world
     seconds: float  # since the first goal
     reason: str
 
 
 class ClutterRun(Struct, frozen=True, kw_only=True):
-    """One world, driven with cameras or by lidar alone."""
+    """Results of one world, with cameras or with lidar alone."""
 
     seed: int
     cameras: bool
@@ -88,23 +88,23 @@ class ClutterRun(Struct, frozen=True, kw_only=True):
     min_clearance_m: float
     distance_m: float
     seconds: float  # from the first goal to the end
-    alone: int  # ticks without the brain
+    alone: int  # ticks that did not wait for the brain
     incidents: tuple[Incident, ...] = ()
     missed: tuple[MissedGoal, ...] = ()
 
     @property
     def unharmed(self) -> bool:
-        """True without contact and fall."""
+        """True without contacts and falls."""
         return not (self.contacts or self.falls)
 
     @property
     def ok(self) -> bool:
-        """True if it also reached most goals."""
+        """True if the robot also reached most goals."""
         return self.unharmed and self.reached >= MIN_REACHED
 
 
 class ClutterResult(Struct, frozen=True, kw_only=True):
-    """All worlds that were driven."""
+    """Results of all worlds so far."""
 
     body: str
     speed: float
@@ -112,11 +112,11 @@ class ClutterResult(Struct, frozen=True, kw_only=True):
     runs: tuple[ClutterRun, ...] = ()
 
     def of(self, cameras: bool) -> list[ClutterRun]:
-        """Return the runs with cameras, or those without."""
+        """Return the runs with or without cameras."""
         return [one for one in self.runs if one.cameras == cameras]
 
     def has(self, seed: int, cameras: bool) -> bool:
-        """Return whether a world was driven."""
+        """Return whether there is a run in the world of a seed."""
         return any((one.seed, one.cameras) == (seed, cameras) for one in self.runs)
 
 
@@ -133,7 +133,7 @@ def seeds_of(text: str) -> tuple[int, ...]:
 
 
 def earlier(path: Path | None, course: ClutterCourse) -> ClutterResult:
-    """Return what a file of results holds, or no runs. Raises ConfigError for another course."""
+    """Read earlier results, or return empty ones. Raises ConfigError for another course."""
     fresh = ClutterResult(body=course.body, speed=course.speed, seconds=course.seconds)
     if path is None or not path.exists():
         return fresh
@@ -156,7 +156,7 @@ async def measure_clutter(
     done: Callable[[ClutterResult], None],
     show: Progress,
 ) -> ClutterResult:
-    """Drive the worlds that `result` does not hold; call `done` after each.
+    """Drive in the worlds that `result` lacks; call `done` after each.
 
     Raises GigabrainError when a process dies on the way.
     """
@@ -176,7 +176,7 @@ async def measure_clutter(
 
 
 def in_words(run: ClutterRun) -> str:
-    """Return what came of one world."""
+    """Return the result of one world as text."""
     text = f"world {run.seed}{'' if run.cameras else ', lidar alone'}: {run.reached} of {GOALS}"
     text += f" goals, {run.contacts} contacts, {run.falls} falls, {run.distance_m:.1f} m"
     for one in run.incidents:
@@ -203,13 +203,13 @@ def _folder(course: ClutterCourse, seed: int) -> Iterator[Path]:
 def lock_stepped(
     body: str, world: Path, seed: int, speed: float, *, cameras: bool = True
 ) -> Deployment:
-    """Return the deployment of a whole robot that maps a world, each tick waiting for its brain."""
+    """Return a deployment that maps a world in lock-step."""
     return Deployment(
         body=body,
         world=str(world),
         seed=seed,
         speed=speed,
-        lockstep_timeout_s=WAIT_S,
+        lockstep_timeout_s=LOCKSTEP_TIMEOUT_S,
         resume="auto",
         router=LOOPBACK,
         cameras=cameras,
@@ -222,31 +222,31 @@ async def _drive(world: ClutteredWorld, course: ClutterCourse, folder: Path) -> 
     deployment = lock_stepped(
         course.body, write_world(world, folder), world.seed, course.speed, cameras=course.cameras
     )
-    async with measured_robot(deployment, folder, START_S) as (group, bus):
-        driven = CourseDriver(bus, group, world, course.seconds)
-        await driven.drive()
-        report = await driven.look()
+    async with measured_robot(deployment, folder, START_TIMEOUT_S) as (group, bus):
+        driver = CourseDriver(bus, group, world, course.seconds)
+        await driver.drive()
+        report = await driver.look()
     return ClutterRun(
         seed=world.seed,
         cameras=course.cameras,
-        reached=driven.reached,
+        reached=driver.reached,
         contacts=int(report["contacts"]),
         falls=int(report["falls"]),
         min_clearance_m=report["min_clearance_m"],
         distance_m=report["distance_m"],
-        seconds=round(driven.seconds, 2),
+        seconds=round(driver.seconds, 2),
         alone=int(report["lockstep_timeouts"]),
-        incidents=tuple(driven.incidents),
-        missed=tuple(driven.missed),
+        incidents=tuple(driver.incidents),
+        missed=tuple(driver.missed),
     )
 
 
 class Over(Exception):
-    """Time is up, or the robot cannot drive on; the text says why."""
+    """Time is up, or the robot cannot drive on; the text is the reason."""
 
 
 class CourseDriver:
-    """Sends a robot to the goals of a world, one after the other, and watches the physics."""
+    """Sends a robot to the goals of a world in turn, and records contacts and falls."""
 
     def __init__(
         self, bus: Bus, group: ProcessGroup, world: ClutteredWorld, seconds: float
@@ -257,7 +257,7 @@ class CourseDriver:
         self._states = bus.latest(STATE)
         self._began_s = 0.0
         self._truth: dict[str, float] = {}
-        self.world_from_map = ORIGIN  # of the map, in the world
+        self.world_from_map = ORIGIN  # pose of the map in the world
         self.reached = 0
         self.incidents: list[Incident] = []
         self.missed: list[MissedGoal] = []
@@ -268,8 +268,8 @@ class CourseDriver:
         return self._bus.time.tick * TICK_NS / 1e9 - self._began_s
 
     async def begin(self) -> None:
-        """Wait until the robot has a map, and tell where that is in the world."""
-        await self._group.until(self._is_localized, "a map, and the robot in it", START_S)
+        """Wait until the robot has a map, and find the map's pose in the world."""
+        await self._group.until(self._is_localized, "a map, and the robot in it", START_TIMEOUT_S)
         await self.look()
         here = self._poses.current
         assert here
@@ -282,9 +282,9 @@ class CourseDriver:
         await self.begin()
         over, world_from_map = "", self.world_from_map
         for number, (x, y) in enumerate(self._world.goals, 1):
-            there = compose(inverse(world_from_map), Pose(x=x, y=y, yaw=0.0))
+            goal = compose(inverse(world_from_map), Pose(x=x, y=y, yaw=0.0))
             try:
-                reason = over or await self._go(there.x, there.y)
+                reason = over or await self._go(goal.x, goal.y)
             except Over as end:
                 reason = over = str(end)
             off = await self._off(x, y)
@@ -299,7 +299,7 @@ class CourseDriver:
             )
 
     async def look(self) -> dict[str, float]:
-        """Return the simulation's truth, and note new contacts and falls."""
+        """Return the simulation's true values, and record new contacts and falls."""
         before, truth = self._truth, dict[str, float]()
         end_s = asyncio.get_running_loop().time() + MAX_SILENCE_S
         while not truth:
@@ -318,7 +318,7 @@ class CourseDriver:
         return truth
 
     async def _go(self, x: float, y: float) -> str:
-        """Drive to a goal in the map; return why it was not reached, empty if it was."""
+        """Drive to a goal in the map; return the reason of a failure, empty on success."""
         try:
             task = await self.accepted(lambda: self.tasks.go_to(x, y))
             ended = await self.while_running(self.tasks.result(task))
@@ -327,7 +327,7 @@ class CourseDriver:
         return "" if ended.state == "succeeded" else f"{ended.state}: {ended.reason}"
 
     async def accepted(self, ask: Callable[[], Awaitable[str]]) -> str:
-        """Return the name of the task; a robot that has just started may not know its pose yet."""
+        """Return the name of the accepted task. Ask again while the robot may not know its pose."""
         loop = asyncio.get_running_loop()
         end_s = loop.time() + MAX_SILENCE_S
         while True:

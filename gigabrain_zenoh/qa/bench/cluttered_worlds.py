@@ -1,4 +1,4 @@
-"""Cluttered worlds, drawn at random: most of what stands there, or gapes, no planar lidar sees.
+"""Random cluttered worlds: a planar lidar does not see most of their objects and pits.
 
 Each is a walled room with ten goals. A search on the true shapes has found a way from goal to goal,
 wide enough for the body to turn anywhere on it.
@@ -23,23 +23,23 @@ from gigabrain_zenoh.navigation.costmap import LETHAL
 from gigabrain_zenoh.navigation.grid_search import GridSearch
 from gigabrain_zenoh.qa.bench.eyes_worlds import Part, Pit, distances
 
-HALF_M = 2.1  # of the room
+HALF_M = 2.1  # half the room's width
 GOALS = 10
-THINGS = (12, 16)  # least and most
-PITS = (1, 3)
-KINDS = (  # as often as they are drawn
+THINGS = (12, 16)  # smallest and largest number
+PITS = (1, 3)  # the same
+KINDS = (  # repeated by their frequency
     "table", "low table", "low table", "box", "box", "box", "bar", "bar", "shelf", "sill", "sill",
     "post", "cupboard",
 )  # fmt: skip
 GAP_M = 0.10  # between two things
-START_M = 0.55  # from the robot's origin to anything, where it starts
+START_M = 0.55  # free radius round the start
 CELL_M = 0.05
-WAY_SPARE_M, GOAL_SPARE_M = 0.08, 0.17  # beside the circle in which the body turns
-LOW_ROOF_M = 0.08  # above the body: the ways that were searched do not lead under lower roofs
-LEG_M, MAX_LEG_M = 0.9, 1.6  # way from goal to goal
-CANDIDATES = 30  # for a goal: the one farthest from those before is taken
-SPREAD_M = 2.0  # of all goals, along x or y
-BARRED_SHARE = 0.8  # of the goals, where the straight way is barred
+WAY_SPARE_M, GOAL_SPARE_M = 0.08, 0.17  # added to the radius in which the body turns
+LOW_ROOF_M = 0.08  # above the body; ways do not lead under lower roofs
+LEG_M, MAX_LEG_M = 0.9, 1.6  # least and largest length of the way from goal to goal
+CANDIDATES = 30  # for a goal; the farthest from earlier goals is chosen
+SPREAD_M = 2.0  # least extent of all goals along x or y
+BARRED_SHARE = 0.8  # of the legs, for which a blocked straight line is preferred
 MAX_DRAWS = 200
 DEEPEST_M = 0.5  # of a pit
 Point = tuple[float, float]
@@ -47,18 +47,18 @@ Point = tuple[float, float]
 
 @dataclass(frozen=True)
 class ClutteredWorld:
-    """A room with things, pits, and goals that can be reached one after the other."""
+    """A room with things, pits, and goals that are reachable in turn."""
 
     seed: int
     parts: tuple[Part, ...]
-    kinds: tuple[str, ...]  # by the number of the thing
+    kinds: tuple[str, ...]  # by a thing's number
     pits: tuple[Pit, ...]
     start: Pose
     goals: tuple[Point, ...]
     legs: tuple[float, ...]  # [m], length of the way to each goal
 
     def name_near(self, x: float, y: float) -> str:
-        """Return the kind of what is nearest to a point."""
+        """Return the kind of the thing, pit or wall that is nearest to a point [m]."""
         at = np.array([[x, y]])
         named = [(one.outline, self.kinds[one.thing]) for one in self.parts]
         named += [(one.outline, "pit") for one in self.pits]
@@ -74,7 +74,7 @@ def draw_cluttered(seed: int, body: BodyDescription) -> ClutteredWorld:
         world = _draw(seed, random, body)
         if world:
             return world
-    raise AssertionError(f"no world with ten goals for seed {seed}")  # of a body too large for it
+    raise AssertionError(f"no world with ten goals for seed {seed}")  # the body is too large
 
 
 def _draw(seed: int, random: np.random.Generator, body: BodyDescription) -> ClutteredWorld | None:
@@ -83,10 +83,10 @@ def _draw(seed: int, random: np.random.Generator, body: BodyDescription) -> Clut
     x, y = random.uniform(-HALF_M + 0.8, HALF_M - 0.8, 2).tolist()
     start = Pose(x=x, y=y, yaw=float(random.uniform(-math.pi, math.pi)))
     pits: list[Pit] = []
-    most = random.integers(PITS[0], PITS[1] + 1)
+    pit_count = random.integers(PITS[0], PITS[1] + 1)
     for _ in range(20):
         pit = _pit(random)
-        if len(pits) < most and _fits(pit.outline, [one.outline for one in pits], start):
+        if len(pits) < pit_count and _fits(pit.outline, [one.outline for one in pits], start):
             pits.append(pit)
     wanted = int(random.integers(THINGS[0], THINGS[1] + 1))
     for _ in range(20 * wanted):
@@ -129,7 +129,7 @@ def _fits(outline: Floats, others: Sequence[Floats], start: Pose) -> bool:
 
 
 def _boxes_gap(one: Floats, other: Floats) -> float:
-    """Return how far apart the upright boxes round two outlines are at least [m]."""
+    """Return the gap between the axis-aligned boxes round two outlines [m]."""
     beyond = np.maximum(one.min(axis=0) - other.max(axis=0), other.min(axis=0) - one.max(axis=0))
     return float(beyond.max())
 
@@ -143,7 +143,7 @@ def _along(outline: Floats) -> Floats:
 
 
 def _thing(random: np.random.Generator, thing: int, kind: str, height: float) -> Iterator[Part]:
-    """Draw one thing of a kind: its parts bear the number `thing`."""
+    """Draw the parts of one thing of a kind; `thing` is its number."""
     x, y = random.uniform(-HALF_M, HALF_M, 2).tolist()
     yaw = float(random.uniform(-math.pi, math.pi))
 
@@ -163,14 +163,14 @@ def _thing(random: np.random.Generator, thing: int, kind: str, height: float) ->
             at = beside(a * (half_x - leg), b * (half_y - leg))
             yield Part(thing, *at, leg, leg, bottom, yaw=yaw)
         yield Part(thing, x, y, half_x, half_y, bottom + 0.02, bottom, yaw)
-    elif kind == "bar":  # between two posts, over the lidar's plane or under it
+    elif kind == "bar":  # between two posts, above or below the lidar's plane
         half, post = draw(0.3, 0.6), draw(0.015, 0.03)
         bottom = height - draw(0.004, 0.012) if random.random() < 0.4 else draw(0.05, 0.12)
         for a in (1, -1):
             at = beside(0.0, a * half)
             yield Part(thing, *at, post, post, 0.5, round=True)
         yield Part(thing, x, y, 0.015, half - post, bottom + 0.03, bottom, yaw)
-    elif kind == "shelf":  # it hangs
+    elif kind == "shelf":  # without legs
         bottom = draw(0.06, 0.12)
         half_x, half_y = draw(0.1, 0.3), draw(0.1, 0.4)
         yield Part(thing, x, y, half_x, half_y, bottom + 0.02, bottom, yaw)
@@ -186,15 +186,15 @@ def _thing(random: np.random.Generator, thing: int, kind: str, height: float) ->
 
 
 class FreeSpace:
-    """The free space of a body by the true shapes of a world, in cells of CELL_M."""
+    """The free space of a body among a world's true shapes, in cells of CELL_M."""
 
     def __init__(self, parts: Sequence[Part], pits: Sequence[Pit], body: BodyDescription) -> None:
-        bars = [one.outline for one in parts if one.bottom < body.body_height + LOW_ROOF_M]
-        self._bars = bars + [one.outline for one in pits]
+        obstacles = [one.outline for one in parts if one.bottom < body.body_height + LOW_ROOF_M]
+        self._obstacles = obstacles + [one.outline for one in pits]
         middles = np.arange(-HALF_M + CELL_M / 2, HALF_M, CELL_M)
         x, y = np.meshgrid(middles, middles)
         points = np.column_stack((x.ravel(), y.ravel()))
-        self._away = distances(self._bars, points)
+        self._away = distances(self._obstacles, points)
         room = np.minimum(self._away, HALF_M - np.abs(points).max(axis=1))
         self._points, self._room = points, room
         self._side, self._turning = len(middles), radius(body.footprint)
@@ -203,41 +203,42 @@ class FreeSpace:
         self._search = GridSearch()
 
     def ways_from(self, place: Point) -> Floats:
-        """Return the length of the way from `place` to each cell (n,) [m]; inf without one."""
+        """Return the length of the way from `place` to each cell (n,) [m]; inf without a way."""
         row, column = divmod(self._cell(place), self._side)
         ways = self._search.field(self._cost, (row, column), "from") * CELL_M
         return np.where(self._cost < LETHAL, ways, np.inf).ravel()
 
     def way(self, begin: Point, end: Point) -> float:
-        """Return the length of the way from one place to another [m]; inf without one."""
+        """Return the length of the way between two places [m]; inf without a way."""
         return float(self.ways_from(begin)[self._cell(end)])
 
     def _cell(self, place: Point) -> int:
         return int(self._cells(np.array(place)))
 
     def _cells(self, places: Floats) -> NDArray[np.intp]:
-        """Return the numbers of the cells in which places (..., 2) [m] are."""
+        """Return the numbers of the cells that contain places (..., 2) [m]."""
         at = np.clip((places + HALF_M) / CELL_M, 0, self._side - 1).astype(np.intp)
         return np.asarray(at[..., 1] * self._side + at[..., 0])
 
     def goals(
         self, random: np.random.Generator, start: Point
     ) -> tuple[tuple[Point, ...], tuple[float, ...]] | None:
-        """Return goals and the ways to them [m]; None where there are not enough."""
+        """Return goals, and the lengths of the ways to them [m]; None if there are too few."""
         here, goals, legs = start, list[Point](), list[float]()
         while len(goals) < GOALS:
             ways = self.ways_from(here)
             good = (ways >= LEG_M) & (ways <= MAX_LEG_M)
             good &= self._room >= self._turning + GOAL_SPARE_M
-            chosen = np.flatnonzero(good)
-            if not len(chosen):
+            possible = np.flatnonzero(good)
+            if not len(possible):
                 return None
-            few = random.choice(chosen, min(len(chosen), CANDIDATES), replace=False)
-            wanted = random.random() < BARRED_SHARE
-            before = np.array((start, *goals))
-            fresh = np.hypot(*(self._points[few, None] - before).transpose(2, 0, 1)).min(axis=1)
-            fresh += [HALF_M * (self._barred(here, one) == wanted) for one in few]
-            at = few[fresh.argmax()]
+            candidates = random.choice(possible, min(len(possible), CANDIDATES), replace=False)
+            prefer_barred = random.random() < BARRED_SHARE
+            earlier = np.array((start, *goals))
+            away = self._points[candidates, None] - earlier
+            score = np.hypot(*away.transpose(2, 0, 1)).min(axis=1)
+            score += [HALF_M * (self._barred(here, one) == prefer_barred) for one in candidates]
+            at = candidates[score.argmax()]
             x, y = self._points[at].tolist()
             here = (round(x, 3), round(y, 3))
             goals.append(here)
@@ -246,17 +247,17 @@ class FreeSpace:
         return (tuple(goals), tuple(legs)) if spread >= SPREAD_M else None
 
     def _barred(self, here: Point, cell: int) -> bool:
-        """Return whether the body cannot go straight to a cell."""
+        """Return whether an obstacle blocks the straight line to a cell."""
         share = np.linspace(0.0, 1.0, 40)[:, None]
         line = np.array(here) + share * (self._points[cell] - here)
         away = float(self._away[self._cells(line)].min())
-        if abs(away - self._turning / 2) < CELL_M:  # the cells' middles do not tell
-            away = float(distances(self._bars, line).min())
+        if abs(away - self._turning / 2) < CELL_M:  # too close for the cells' resolution
+            away = float(distances(self._obstacles, line).min())
         return away < self._turning / 2
 
 
 def write_world(world: ClutteredWorld, folder: Path) -> Path:
-    """Write the world file and its model; return the former."""
+    """Write the world file and its model; return the path of the world file."""
     (folder / "things.xml").write_text(mjcf(world), "utf-8")
     path = folder / "cluttered.yaml"
     start = [world.start.x, world.start.y, world.start.yaw]

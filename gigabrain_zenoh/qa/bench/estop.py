@@ -1,4 +1,4 @@
-"""`gigabrain bench estop`: from the press to the gate's zero, and how far the body still moves."""
+"""`gigabrain bench estop`: time from a press to the gate's zero, and the body's travel to rest."""
 
 import asyncio
 import contextlib
@@ -29,10 +29,10 @@ if TYPE_CHECKING:
 
 Progress = Callable[[str], None]
 SPEED = 0.26  # [m/s]
-FAST = 0.9  # share of it, from which the robot counts as driving
-STILL = 0.005  # [m/s]
+DRIVING_SHARE = 0.9  # of SPEED, above which the robot counts as driving
+MAX_REST_SPEED = 0.005  # [m/s]
 MAX_P99_MS, MAX_MS, MAX_TRAVEL_M = 50.0, 100.0, 0.06  # targets
-APART_S = 0.02  # between two presses while it is latched
+PAUSE_S = 0.02  # between two presses of a latched robot
 
 
 class PressTimes(Struct, frozen=True, kw_only=True):
@@ -40,7 +40,7 @@ class PressTimes(Struct, frozen=True, kw_only=True):
 
     name: str
     ms: tuple[float, ...]  # from the press to its answer
-    travel_m: tuple[float, ...]  # from the press to rest, of those pressed while driving
+    travel_m: tuple[float, ...]  # from the press to rest, for presses while driving
 
     def p(self, share: float) -> float:
         """Return a percentile of the times [ms]."""
@@ -55,7 +55,7 @@ class EstopResult(Struct, frozen=True, kw_only=True):
 
 
 async def measure_estop(body: str, driving: int, latched: int, show: Progress) -> EstopResult:
-    """Press while it drives and while it is latched, on an idle and on a flooded network."""
+    """Press while the robot drives and while it is latched, on an idle and a flooded network."""
     decision = DecisionConfig(settings={"max_linear_speed": SPEED})
     deployment = with_free_port(
         Deployment(body=body, resume="manual", router=LOOPBACK, decision=decision)
@@ -77,15 +77,15 @@ class _Operator:
     def __init__(self, bus: Bus, group: ProcessGroup) -> None:
         self._bus, self._group = bus, group
         self._trail: list[RobotState] = []
-        self._enabling = False  # whether a request to enable is under way
+        self._enabling = False  # True while a request to enable waits for its reply
         self._state = bus.latest(STATE, self._trail.append)
 
     async def presses(self, name: str, driving: int, latched: int, show: Progress) -> PressTimes:
-        """Press `driving` times while it drives, and `latched` times while it is latched."""
+        """Press `driving` times while the robot drives, and `latched` times while it is latched."""
         times, travels = [], []
         for count in range(driving):
             show(f"{name}: press {count + 1} of {driving} while it drives")
-            await self._group.until(self._fast, "the robot drives")
+            await self._group.until(self._is_driving, "the robot drives")
             start = self._trail[-1]
             self._trail.clear()
             times.append(await self._press())
@@ -93,26 +93,26 @@ class _Operator:
             travels.append(path_until_rest([start, *self._trail], _rests) or 0.0)
         for _ in range(latched):
             times.append(await self._press())
-            await asyncio.sleep(APART_S)
+            await asyncio.sleep(PAUSE_S)
         return PressTimes(name=name, ms=tuple(times), travel_m=tuple(travels))
 
     async def _press(self) -> float:
-        began = time.perf_counter()
+        begin_s = time.perf_counter()
         await press_estop(self._bus, "bench")
-        return (time.perf_counter() - began) * 1e3
+        return (time.perf_counter() - begin_s) * 1e3
 
-    def _fast(self) -> bool:
-        """Return whether it drives; enables it where the gate is shut."""
+    def _is_driving(self) -> bool:
+        """Return whether the robot drives; enable it if the gate is shut."""
         state = self._state.fresh()
         if state is None:
             return False
         if state.gate.mode != "enabled" and not self._enabling:
             self._enabling = True
             asyncio.get_running_loop().create_task(self._enable(state.gate.estop_generation))
-        return state.velocity.linear_x > FAST * SPEED
+        return state.velocity.linear_x > DRIVING_SHARE * SPEED
 
     async def _enable(self, generation: int) -> None:
-        """Release, then enable; refused until the body rests, and tried again."""
+        """Release, then enable. The gate refuses until the body rests; the caller tries again."""
         with contextlib.suppress(Refused):
             await self._bus.ask(RELEASE, ReleaseRequest(estop_generation=generation))
             await self._bus.ask(ENABLE, EnableRequest(source=BRAIN))
@@ -120,11 +120,11 @@ class _Operator:
 
 
 def _rests(state: RobotState) -> bool:
-    return state.gate.mode == "latched" and abs(state.velocity.linear_x) < STILL
+    return state.gate.mode == "latched" and abs(state.velocity.linear_x) < MAX_REST_SPEED
 
 
 def estop_page(result: EstopResult) -> "Group":
-    """Return what `gigabrain bench estop` prints."""
+    """Return the page that `gigabrain bench estop` prints."""
     from rich.console import Group
     from rich.text import Text
 

@@ -1,4 +1,4 @@
-"""Contours against MuJoCo's truth: errors, recall, false ones, ghosts, and what they cost."""
+"""Contours compared with MuJoCo's true shapes: errors, recall, false contours, ghosts, CPU."""
 
 import math
 import time
@@ -31,16 +31,16 @@ from gigabrain_zenoh.qa.bench.eyes_worlds import (
 from gigabrain_zenoh.vision.camera_model import CameraModel
 from gigabrain_zenoh.vision.obstacle_contours import ObstacleContours
 
-PICTURES, PERIOD_S = 10, 0.1  # of a cluttered world, while the robot drives in an arc
+PICTURES, PERIOD_S = 10, 0.1  # per cluttered world, while the robot drives on an arc
 SPEED, TURN = 0.2, 0.2  # [m/s], [rad/s]
-ERROR_REACH_M, RECALL_REACH_M = 3.0, 2.0
+ERROR_REACH_M, RECALL_REACH_M = 3.0, 2.0  # largest distance from the robot that counts
 STEP_M, EDGE_STEP_M = 0.02, 0.004  # between points of outlines
 BEARING_STEP = math.radians(0.5)
-MIN_SEEN_M = 0.028  # of what is seen of a thing, for recall: 3 cm less what a pixel may hide
+MIN_SEEN_M = 0.028  # visible size of a thing that counts: 3 cm, less the size of a pixel
 FOUND_M, FOUND_SHARE = 0.05, 0.5  # distance to a contour, and share of a thing's points within it
-PIT_SEEN_M = 0.03  # below the floor
-FALSE_M = 0.10  # a contour that is nowhere nearer to a thing is none
-GHOST_M = 0.03  # a contour so near to where the thing stood is its ghost
+PIT_SEEN_M = 0.03  # least depth below the floor
+FALSE_M = 0.10  # a contour farther than this from all things is false
+GHOST_M = 0.03  # a contour nearer than this to a thing's old place is a ghost
 GHOST_KINDS = ("gone", "walks off", "gone unseen")
 SEEN_S, GHOST_WAIT_S = 1.0, 3.0
 
@@ -51,10 +51,10 @@ class EyesFigures(Struct, frozen=True, kw_only=True):
     sensor: str
     camera: str
     worlds: int
-    error_p50_m: float  # from the first thing along each line of sight to the nearest outline
+    error_p50_m: float  # from the first surface along each line of sight to the nearest outline
     error_p95_m: float
-    beyond_p95_m: float  # of outlines beyond the truth
-    missed_p95_m: float  # of what is seen beyond outlines
+    beyond_p95_m: float  # from outlines to the true shapes
+    missed_p95_m: float  # from visible points to outlines
     pit_p50_m: float
     pit_p95_m: float
     pits: int  # in view
@@ -64,9 +64,9 @@ class EyesFigures(Struct, frozen=True, kw_only=True):
     recall_first: float  # in the first picture
     false_in_clutter: int
     false_per_min: float  # on empty floors
-    colour_per_min: float  # ... by the floor's colour alone
+    colour_per_min: float  # the same, by the floor's colour alone
     empty_pictures: int
-    ghosts: int  # things that went away
+    ghosts: int  # things that were removed
     ghost_p50_s: float
     ghost_max_s: float
     cpu_p50_ms: float
@@ -74,7 +74,7 @@ class EyesFigures(Struct, frozen=True, kw_only=True):
 
 
 class EyesResult(Struct, frozen=True, kw_only=True):
-    """All figures, and the seed that they begin at."""
+    """All figures, and the first seed."""
 
     seed: int
     figures: tuple[EyesFigures, ...]
@@ -82,7 +82,7 @@ class EyesResult(Struct, frozen=True, kw_only=True):
 
 @dataclass
 class Eyes:
-    """A body's contours, and its camera with errors, before a renderer."""
+    """A body's contours, and its camera with errors, which sees a renderer's pictures."""
 
     body: BodyDescription
     errors: DepthErrors
@@ -97,7 +97,7 @@ class Eyes:
     def see(
         self, renderer: Renderer, pose: Pose, now: float, thing: tuple[float, float] = (0.0, 0.0)
     ) -> tuple[Contour, ...]:
-        """Return the contours after one more picture."""
+        """Take one more picture and return the contours."""
         renderer.move(pose, self.sensor.mounted, thing)
         pixels = self.sensor.measure(renderer.depth())
         height, width = pixels.shape
@@ -113,7 +113,7 @@ class Eyes:
 
 @dataclass
 class ClutterScores:
-    """The scores of all cluttered worlds together."""
+    """Scores of all cluttered worlds: errors [m], and found pits and things."""
 
     front: list[float] = field(default_factory=list)
     beyond: list[float] = field(default_factory=list)
@@ -133,9 +133,9 @@ def measure_eyes(
     seed: int,
     show: Callable[[str], None],
 ) -> EyesResult:
-    """Measure the first camera of each body, with a sensor's errors and without.
+    """Measure the first camera of each body, with and without a sensor's errors.
 
-    `seconds` are spent on each of 15 empty floors. Raises ConfigError where nothing can be drawn.
+    It drives for `seconds` on each of 15 empty floors. Raises ConfigError if rendering fails.
     """
     figures = []
     for body in bodies:
@@ -168,12 +168,12 @@ def _summed(
         sensor=sensor,
         camera=body.cameras[0].name,
         worlds=worlds,
-        error_p50_m=_at(scores.front, 0.5),
-        error_p95_m=_at(scores.front, 0.95),
-        beyond_p95_m=_at(scores.beyond, 0.95),
-        missed_p95_m=_at(scores.missed, 0.95),
-        pit_p50_m=_at(scores.pit, 0.5),
-        pit_p95_m=_at(scores.pit, 0.95),
+        error_p50_m=_percentile(scores.front, 0.5),
+        error_p95_m=_percentile(scores.front, 0.95),
+        beyond_p95_m=_percentile(scores.beyond, 0.95),
+        missed_p95_m=_percentile(scores.missed, 0.95),
+        pit_p50_m=_percentile(scores.pit, 0.5),
+        pit_p95_m=_percentile(scores.pit, 0.95),
         pits=len(scores.pits),
         pits_found=mean(scores.pits) if scores.pits else 1.0,
         things=len(scores.found),
@@ -184,19 +184,19 @@ def _summed(
         colour_per_min=empty.by_colour / (empty.pictures * PERIOD_S / 60),
         empty_pictures=empty.pictures,
         ghosts=len(ghosts),
-        ghost_p50_s=_at(ghosts, 0.5),
+        ghost_p50_s=_percentile(ghosts, 0.5),
         ghost_max_s=max(ghosts, default=0.0),
-        cpu_p50_ms=_at(cpu, 0.5),
-        cpu_p99_ms=_at(cpu, 0.99),
+        cpu_p50_ms=_percentile(cpu, 0.5),
+        cpu_p99_ms=_percentile(cpu, 0.99),
     )
 
 
-def _at(values: Sequence[float], share: float) -> float:
+def _percentile(values: Sequence[float], share: float) -> float:
     return round(percentile(sorted(values), share) or 0.0, 4)
 
 
 def _driven(picture: int, turn: float = TURN) -> Pose:
-    """Return the pose of the robot after some pictures, on an arc from the origin."""
+    """Return the robot's pose at a picture's number, on an arc from the origin."""
     yaw = turn * picture * PERIOD_S
     if not turn:
         return Pose(x=SPEED * picture * PERIOD_S, y=0.0, yaw=0.0)
@@ -204,7 +204,7 @@ def _driven(picture: int, turn: float = TURN) -> Pose:
 
 
 def _clutter(eyes: Eyes, world: EyesWorld, scores: ClutterScores) -> None:
-    """Drive before a cluttered world, and judge the contours after the last picture."""
+    """Drive in a cluttered world, and judge the contours after the last picture."""
     turn = TURN if eyes.seed % 2 else -TURN
     with Renderer(world, eyes.camera) as renderer:
         for number in range(PICTURES):
@@ -218,7 +218,7 @@ def _clutter(eyes: Eyes, world: EyesWorld, scores: ClutterScores) -> None:
 
 
 class _Truth:
-    """The true view of a camera, without errors, in the world's frame."""
+    """The true view of a camera without errors, in the world's frame."""
 
     def __init__(self, eyes: Eyes, renderer: Renderer, world: EyesWorld, pose: Pose) -> None:
         self.world, self.pose, self.height = world, pose, eyes.body.body_height
@@ -236,7 +236,7 @@ class _Truth:
     def _pit_seen(
         self, model: CameraModel, depth: NDArray[np.float32], part: NDArray[np.int32]
     ) -> Floats:
-        """Return where lines of sight that end below the floor go through it (n, 2)."""
+        """Return the points (n, 2) [m] where lines of sight into a pit cross the floor."""
         down = (part < 0) & (model.rays[2] * depth + model.origin[2] < -PIT_SEEN_M)
         rays = model.rays[:, down].astype(np.float64)
         through = (rays[:2] * (-model.origin[2] / rays[2])).T + model.origin[:2]
@@ -255,32 +255,32 @@ def _outlines(pose: Pose, contours: Sequence[Contour], *, holes: bool) -> list[F
 
 
 def _found(truth: _Truth, contours: Sequence[Contour]) -> list[bool]:
-    """Return whether each thing in view, near and large enough, is covered by contours."""
+    """Return for each visible, near and large enough thing whether contours cover it."""
     outlines = _outlines(truth.pose, contours, holes=False)
     found = []
     for number in np.unique(truth.thing).tolist():
-        mine = truth.points[truth.thing == number]
-        near = truth.away[truth.thing == number]
+        points = truth.points[truth.thing == number]
+        away = truth.away[truth.thing == number]
         if (
-            near.max() > RECALL_REACH_M
-            or np.ptp(mine[:, 2]) < MIN_SEEN_M
-            or _width(mine, truth.pose) < MIN_SEEN_M
+            away.max() > RECALL_REACH_M
+            or np.ptp(points[:, 2]) < MIN_SEEN_M
+            or _width(points, truth.pose) < MIN_SEEN_M
         ):
             continue
-        covered = distances(outlines, mine[:, :2]) < FOUND_M
+        covered = distances(outlines, points[:, :2]) < FOUND_M
         found.append(bool(covered.mean() >= FOUND_SHARE))
     return found
 
 
 def _width(points: Floats, pose: Pose) -> float:
-    """Return how wide points (n, 3) are across the line of sight [m]."""
+    """Return the extent of points (n, 3) across the line of sight [m]."""
     x, y = points[:, 0] - pose.x, points[:, 1] - pose.y
     bearing = math.atan2(y.mean(), x.mean())
     return float(np.ptp(y * math.cos(bearing) - x * math.sin(bearing)))
 
 
 def _judge_outlines(truth: _Truth, contours: Sequence[Contour], scores: ClutterScores) -> None:
-    """Add the distances from outlines to the truth, and from the truth to outlines."""
+    """Add the distances from outlines to true shapes, and from true points to outlines."""
     solids, pit = truth.world.solids(truth.height), truth.world.pit
     here = np.array((truth.pose.x, truth.pose.y))
     outlines = _outlines(truth.pose, contours, holes=False)
@@ -337,7 +337,7 @@ def _along(outline: Floats, step: float = STEP_M) -> Floats:
 
 
 class EmptyFloors(NamedTuple):
-    """Contours that there are on empty floors, and the pictures taken there."""
+    """Numbers of contours on empty floors, and of pictures taken there."""
 
     by_depth: int
     by_colour: int
@@ -347,7 +347,7 @@ class EmptyFloors(NamedTuple):
 def _empty_floors(
     body: BodyDescription, errors: DepthErrors, seconds: float, seed: int
 ) -> EmptyFloors:
-    """Drive on empty floors, and count the contours by depth, and by colour alone."""
+    """Drive on empty floors; count the contours by depth, and by colour alone."""
     depth = colour = 0
     count = max(1, round(seconds / PERIOD_S))
     for number, (texture, light) in enumerate((t, one) for t in TEXTURES for one in LIGHTS):
@@ -367,7 +367,7 @@ def _empty_floors(
 
 
 def _ghost(eyes: Eyes, seed: int) -> float:
-    """Return how long a contour stays where a thing no longer is, once that is seen [s]."""
+    """Return how long a removed thing's contour stays after its place is seen empty [s]."""
     random = np.random.default_rng(np.random.SeedSequence((seed, 19)))
     kind = GHOST_KINDS[seed % len(GHOST_KINDS)]
     away, angle = random.uniform(0.7, 2.5), random.uniform(-0.3, 0.3)
@@ -388,7 +388,7 @@ def _ghost(eyes: Eyes, seed: int) -> float:
 def _ghost_story(
     kind: str, aside: Pose
 ) -> Iterator[tuple[float, Pose, tuple[float, float], float | None]]:
-    """Yield time, pose, how far the thing has moved, and since when it is seen to be gone."""
+    """Yield time [s], pose, shift of the thing [m], and time since it is seen to be gone [s]."""
     far = (100.0, 0.0)
     pictures = round(SEEN_S / PERIOD_S)
     for number in range(pictures):
@@ -410,7 +410,7 @@ def _ghost_story(
 def _haunted(
     pose: Pose, contours: Sequence[Contour], stood: Floats, moved: tuple[float, float]
 ) -> bool:
-    """Return whether a contour is where the thing stood, or on its way to where it is now."""
+    """Return whether a contour covers the thing's old place, and not only its new one."""
     now = stood + moved
     for outline in _outlines(pose, contours, holes=False):
         samples = _along(outline)

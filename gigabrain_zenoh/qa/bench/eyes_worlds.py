@@ -1,4 +1,4 @@
-"""Worlds for the benchmark of eyes: drawn at random, rendered by MuJoCo, with their outlines."""
+"""Random worlds for `gigabrain bench eyes`, with their outlines, rendered by MuJoCo."""
 
 import math
 from collections.abc import Iterator, Sequence
@@ -18,13 +18,13 @@ from gigabrain_schemas.body import BodyDescription, Camera
 from gigabrain_zenoh.geometry.polygon import distance
 from gigabrain_zenoh.vision.camera_model import rotation
 
-NEAR_M, FAR_M = 0.02, 50.0  # of what is drawn
-CIRCLE = 24  # corners of the polygon that stands for a circle
-CLEAR_M = 0.5  # round the place where the robot drives
-FLOOR_M = 20.0
+NEAR_M, FAR_M = 0.02, 50.0  # clipping planes of the renderer
+CIRCLE = 24  # corners of the polygon that approximates a circle
+CLEAR_M = 0.5  # free of things, round the place where the robot drives
+FLOOR_M = 20.0  # half its size
 Texture = Literal["plain", "checker", "stripes", "specks", "tiles"]
 TEXTURES: tuple[Texture, ...] = ("plain", "checker", "stripes", "specks", "tiles")
-LIGHTS = {  # direction of the sun, its brightness, and that of everything else
+LIGHTS = {  # direction of the sun, its brightness, and that of the ambient light
     "noon": ((0.1, 0.1, -1.0), 0.6, 0.4),
     "evening": ((1.0, 0.3, -0.35), 0.8, 0.2),
     "dim": ((0.2, -0.4, -1.0), 0.15, 0.1),
@@ -81,12 +81,12 @@ class EyesWorld(NamedTuple):
     backdrop: Part | None = None  # a wall that stays when the things move
 
     def solids(self, body_height: float) -> list[Floats]:
-        """Return the outlines of all that is lower than the body."""
+        """Return the outlines of all parts that reach down below the body's top."""
         return [one.outline for one in self.parts if one.bottom < body_height]
 
 
 def bodies() -> tuple[BodyDescription, BodyDescription]:
-    """Return the bodies whose first cameras are measured: one low, one that looks down."""
+    """Return the two bodies to measure: the first camera of one is low, the other's looks down."""
     waffle = load_robot("turtlebot3_waffle").description()
     mast = replace(waffle.cameras[0], name="mast", x=0.05, z=0.5, pitch=0.4)
     return waffle, replace(waffle, robot_type="mast", body_height=0.55, cameras=(mast,))
@@ -100,7 +100,7 @@ def distances(outlines: Sequence[Floats], points: Floats) -> Floats:
 
 
 def draw_world(seed: int) -> EyesWorld:
-    """Return a cluttered world: boxes, cylinders, tables, sills, walls, and steps down in half."""
+    """Return a world with boxes, cylinders, tables, sills and walls; every other one has a pit."""
     random = np.random.default_rng(np.random.SeedSequence((seed, 18)))
     parts: list[Part] = []
     pit = None
@@ -118,19 +118,20 @@ def draw_world(seed: int) -> EyesWorld:
 
 
 def _is_clear(new: list[Part], parts: list[Part], pit: Pit | None) -> bool:
-    mine = np.concatenate([one.outline for one in new])
-    dense = np.concatenate([mine, (mine + np.roll(mine, 1, axis=0)) / 2])
+    corners = np.concatenate([one.outline for one in new])
+    dense = np.concatenate([corners, (corners + np.roll(corners, 1, axis=0)) / 2])
     others = [one.outline for one in parts] + ([pit.outline] if pit else [])
-    drives = np.array([[-0.3, -0.3], [0.3, -0.3], [0.3, 0.3], [-0.3, 0.3]])
-    if distances([drives], dense).min() < CLEAR_M - 0.3:
+    driven_area = np.array([[-0.3, -0.3], [0.3, -0.3], [0.3, 0.3], [-0.3, 0.3]])
+    if distances([driven_area], dense).min() < CLEAR_M - 0.3:
         return False
-    back = np.concatenate(others) if others else np.empty((0, 2))
-    mine_to = distances([one.outline for one in new], back).min() if len(back) else np.inf
-    return min(float(distances(others, dense).min()), float(mine_to)) > 0.08
+    other_corners = np.concatenate(others) if others else np.empty((0, 2))
+    outlines = [one.outline for one in new]
+    to_new = distances(outlines, other_corners).min() if len(other_corners) else np.inf
+    return min(float(distances(others, dense).min()), float(to_new)) > 0.08
 
 
 def _thing(random: np.random.Generator, thing: int) -> Iterator[Part]:
-    """Draw one thing: its parts bear the number `thing`."""
+    """Draw the parts of one thing; `thing` is its number."""
     away, angle = random.uniform(0.6, 3.2), random.uniform(-0.5, 0.5)
     x, y, yaw = away * math.cos(angle), away * math.sin(angle), random.uniform(-math.pi, math.pi)
     kind = random.choice(("box", "low", "cylinder", "table", "shelf", "sill", "wall", "least"))
@@ -142,7 +143,7 @@ def _thing(random: np.random.Generator, thing: int) -> Iterator[Part]:
             leg_x, leg_y = x + cos * dx - sin * dy, y + sin * dx + cos * dy
             yield Part(thing, leg_x, leg_y, legs, legs, top, yaw=yaw)
         yield Part(thing, x, y, half, half, top + 0.03, top, yaw)
-    elif kind == "shelf":  # it hangs lower than the body is high
+    elif kind == "shelf":  # hangs lower than the body's top
         bottom, half = random.uniform(0.06, 0.12), random.uniform(0.1, 0.3)
         yield Part(thing, x, y, half, random.uniform(0.1, 0.3), bottom + 0.05, bottom, yaw)
     elif kind == "cylinder":
@@ -168,14 +169,14 @@ def _thing(random: np.random.Generator, thing: int) -> Iterator[Part]:
 
 
 class Renderer:
-    """Renders a world from where a camera sits. Used as `with`: it holds graphics memory."""
+    """Renders a world from a camera's pose. Use it in `with`: it holds graphics memory."""
 
     def __init__(self, world: EyesWorld, camera: Camera) -> None:
-        """Make it. Raises ConfigError where nothing can be drawn."""
+        """Open the graphics. Raises ConfigError if rendering is impossible."""
         self._camera = camera
         self.model = _spec(world, camera).compile()
-        drawn = self.model.vis.global_
-        drawn.offwidth, drawn.offheight = camera.width, camera.height
+        visual = self.model.vis.global_
+        visual.offwidth, visual.offheight = camera.width, camera.height
         self.data = mujoco.MjData(self.model)
         self._floors = self.model.ngeom - len(world.parts)
         self._graphics = open_graphics(camera.width, camera.height)
@@ -192,7 +193,7 @@ class Renderer:
         self._graphics.free()
 
     def move(self, pose: Pose, mounted: Camera, thing: tuple[float, float] = (0.0, 0.0)) -> None:
-        """Put the robot, whose camera really is `mounted`, at a pose, and move all things."""
+        """Place the robot and shift all things; `mounted` is the camera's true mounting."""
         turn = rotation(0.0, 0.0, pose.yaw)
         place = turn @ (mounted.x, mounted.y, mounted.z) + (pose.x, pose.y, 0.0)
         matrix = turn @ rotation(mounted.roll, mounted.pitch, mounted.yaw)
@@ -216,14 +217,14 @@ class Renderer:
         return self._draw(shadows=True)[0]
 
     def parts(self) -> NDArray[np.int32]:
-        """Return the number of the part that each pixel shows, -1 for none."""
+        """Return the number of the visible part for each pixel; -1 for none."""
         for flag in (mujoco.mjtRndFlag.mjRND_SEGMENT, mujoco.mjtRndFlag.mjRND_IDCOLOR):
             self._scene.flags[flag] = 1
         colours = self._draw(shadows=False)[0].astype(np.int32)
         for flag in (mujoco.mjtRndFlag.mjRND_SEGMENT, mujoco.mjtRndFlag.mjRND_IDCOLOR):
             self._scene.flags[flag] = 0
         drawn = colours[..., 0] + colours[..., 1] * 256 + colours[..., 2] * 65536 - 1
-        geoms = np.full(self._scene.ngeom + 1, -1, np.int32)  # the last one: nothing is drawn
+        geoms = np.full(self._scene.ngeom + 1, -1, np.int32)  # the last one: background
         for one in self._scene.geoms[: self._scene.ngeom]:
             if one.segid >= 0 and one.objtype == mujoco.mjtObj.mjOBJ_GEOM:
                 geoms[one.segid] = one.objid
@@ -234,10 +235,10 @@ class Renderer:
         width, height = self._camera.width, self._camera.height
         self._scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = shadows
         colours, raw = np.empty((height, width, 3), np.uint8), np.empty((height, width), np.float32)
-        whole = mujoco.MjrRect(0, 0, width, height)
-        mujoco.mjr_render(whole, self._scene, self._context)
-        mujoco.mjr_readPixels(colours, raw, whole, self._context)
-        # OpenGL counts rows from below; the depth buffer holds 1 at the near plane, 0 at the far
+        viewport = mujoco.MjrRect(0, 0, width, height)
+        mujoco.mjr_render(viewport, self._scene, self._context)
+        mujoco.mjr_readPixels(colours, raw, viewport, self._context)
+        # OpenGL's first row is the lowest; the depth is 1 at the near plane, 0 at the far plane
         depth = NEAR_M * FAR_M / (NEAR_M + (FAR_M - NEAR_M) * raw[::-1])
         return np.ascontiguousarray(colours[::-1]), depth.astype(np.float32)
 
@@ -313,7 +314,7 @@ def _add_floor(spec: mujoco.MjSpec, world: EyesWorld) -> None:
         (pit.x, (right - FLOOR_M) / 2, pit.half_x, (right + FLOOR_M) / 2, 0.0),
         (pit.x, pit.y, pit.half_x, pit.half_y, low),
     ):
-        half_z = 0.5 + (top - low) / 2  # down to the same depth: the sides of the pit
+        half_z = 0.5 + (top - low) / 2  # all reach the same depth, as sides of the pit
         spec.worldbody.add_geom(
             type=mujoco.mjtGeom.mjGEOM_BOX, size=(half_x, half_y, half_z),
             pos=(x, y, top - half_z), material="floor",

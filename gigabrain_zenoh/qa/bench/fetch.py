@@ -1,4 +1,4 @@
-"""`gigabrain bench fetch`: a robot with a base and an arm brings a can, judged by the physics."""
+"""`gigabrain bench fetch`: a robot with a base and an arm brings a can; the physics judge it."""
 
 import json
 import math
@@ -21,7 +21,7 @@ from gigabrain_zenoh.errors import BodyLost, Refused
 from gigabrain_zenoh.geometry.pose import compose, inverse, to_parent
 from gigabrain_zenoh.navigation.global_planner import warm_up
 from gigabrain_zenoh.qa.bench.clutter import (
-    START_S,
+    START_TIMEOUT_S,
     CourseDriver,
     Over,
     Progress,
@@ -30,7 +30,7 @@ from gigabrain_zenoh.qa.bench.clutter import (
 from gigabrain_zenoh.qa.bench.cluttered_worlds import ClutteredWorld, Point
 from gigabrain_zenoh.qa.robot_under_test import ProcessGroup, measured_robot
 
-LONG_M, WIDE_M = 6.0, 4.0  # of two rooms with a door in the wall between them
+LONG_M, WIDE_M = 6.0, 4.0  # two rooms together; the wall between them has a door
 DOOR_M = 1.2
 # 0.12 m tall, 160 g: a label with a band between two rims of metal; its core stands on the floor
 CAN = """<mujoco>
@@ -43,29 +43,29 @@ CAN = """<mujoco>
     <geom size=".027 .06" mass=".01"/>
   </body></worldbody></mujoco>
 """
-AHEAD_M = 0.3  # of the body, where it puts the can down
-BROUGHT_M = 0.15  # from there, by the physics: a goal may be missed by 10 cm
+AHEAD_M = 0.3  # distance from the body at which it puts the can down
+BROUGHT_M = 0.15  # largest error of the can's place: the base may miss its goal by 10 cm
 UPRIGHT = 0.95  # cosine of the can's tilt
-GAP_M = 0.55  # between things, so that a base passes
+GAP_M = 0.55  # between things, enough for a base
 CARTONS = 4
-WALK_S = 0.4  # [m/s] of the person
+WALK_M_S = 0.4  # speed of the person
 
 
 class FetchRun(Struct, frozen=True, kw_only=True):
-    """One world."""
+    """The result of one world."""
 
     seed: int
-    outcome: str  # brought, or how far it came
+    outcome: str  # "brought" or "not brought"
     reason: str = ""
-    off_m: float | None = None  # of the can from its place, by the physics
-    contacts: int = 0  # of base and arm with anything but what the hand touches
+    off_m: float | None = None  # distance of the can from its target, by the physics
+    contacts: int = 0  # of base and arm; those of the hand do not count
     seconds: float = 0.0  # of the robot's time
     distance_m: float = 0.0
-    alone: int = 0  # ticks without the brain
+    alone: int = 0  # ticks that did not wait for the brain
 
 
 class FetchResult(Struct, frozen=True, kw_only=True):
-    """All worlds."""
+    """The results of all worlds."""
 
     body: str
     speed: float
@@ -74,19 +74,19 @@ class FetchResult(Struct, frozen=True, kw_only=True):
 
 
 class FetchWorld(Struct, frozen=True, kw_only=True):
-    """Two rooms with cartons, a can in the far one, and a place to bring it to in the near one."""
+    """Two rooms with cartons: the can is in the far one, its target in the near one."""
 
     start: Pose
     can: Point
-    drop: Pose  # of the body when it puts the can down
+    drop: Pose  # of the body, to put the can down
     cartons: tuple[tuple[float, float, float, float], ...]  # x, y, side, height [m]
-    door: float  # [m], its middle along y
+    door: float  # [m], y of its middle
 
 
 async def measure_fetch(
     seeds: Sequence[int], body: str, speed: float, seconds: float, show: Progress, *, people: bool
 ) -> FetchResult:
-    """Have a robot fetch a can in each world. Raises GigabrainError when a process dies."""
+    """Let a robot fetch a can in each world. Raises GigabrainError when a process dies."""
     warm_up()
     runs: list[FetchRun] = []
     for seed in seeds:
@@ -97,11 +97,11 @@ async def measure_fetch(
 
 
 def in_words(run: FetchRun) -> str:
-    """Return what came of one world."""
+    """Return the result of one world as text."""
     off = "" if run.off_m is None else f", {run.off_m * 100:.0f} cm off"
-    why = f": {run.reason}" if run.reason else ""
+    reason = f": {run.reason}" if run.reason else ""
     return (
-        f"world {run.seed}: {run.outcome}{off}{why}; {run.contacts} contacts, "
+        f"world {run.seed}: {run.outcome}{off}{reason}; {run.contacts} contacts, "
         f"{run.distance_m:.1f} m, {run.seconds:.0f} s"
     )
 
@@ -113,7 +113,7 @@ def draw(seed: int) -> FetchWorld:
     places: list[tuple[Point, float]] = []
 
     def place(low: float, high: float, radius: float) -> Point:
-        """Return a free place, with x between two numbers, and take it."""
+        """Return a free place with x between `low` and `high` [m], and reserve it."""
         while True:
             x = float(random.uniform(low + radius + 0.35, high - radius - 0.35))
             y = float(random.uniform(-half_y + radius + 0.35, half_y - radius - 0.35))
@@ -140,7 +140,7 @@ def draw(seed: int) -> FetchWorld:
 
 
 def write(world: FetchWorld, folder: Path, *, people: bool) -> Path:
-    """Write a world's files; return the one that names the others."""
+    """Write a world's files; return the path of the world file."""
     (folder / "can.xml").write_text(CAN.format(x=world.can[0], y=world.can[1]))
     half = WIDE_M / 2
     wall = {
@@ -157,7 +157,7 @@ def write(world: FetchWorld, folder: Path, *, people: bool) -> Path:
             {"at": [x, y], "size": [side, side, height], "material": "carton"}
             for x, y, side, height in world.cartons
         ],
-        "people": [{"path": walk, "speed": WALK_S}] if people else [],
+        "people": [{"path": walk, "speed": WALK_M_S}] if people else [],
     }
     path = folder / "fetch.yaml"
     path.write_text(json.dumps(content), "utf-8")  # JSON is YAML
@@ -165,7 +165,7 @@ def write(world: FetchWorld, folder: Path, *, people: bool) -> Path:
 
 
 def fetch_mission(drop: Pose) -> str:
-    """Return the mission that brings a can to before a pose of the body in the map."""
+    """Return the mission that puts the can in front of a pose of the body, in the map."""
     return text_of(
         Mission(
             things={"can": Solid(label="can")},
@@ -182,7 +182,7 @@ def fetch_mission(drop: Pose) -> str:
 
 
 class FetchDriver(CourseDriver):
-    """Gives a robot the mission to bring the can, and watches the physics."""
+    """Sends a robot the mission to bring the can, and records contacts and falls."""
 
     def __init__(
         self, bus: Bus, group: ProcessGroup, world: ClutteredWorld, seconds: float
@@ -191,11 +191,11 @@ class FetchDriver(CourseDriver):
         self._scenes, self._sim_poses = bus.latest(SIM_SCENE), bus.latest(SIM_POSES)
 
     async def fetch(self, drop: Pose) -> str:
-        """Bring the can to before a pose in the world; return why it was not done."""
+        """Bring the can to a pose in the world; return why that failed, empty on success."""
         await self.begin()
-        there = compose(inverse(self.world_from_map), drop)
+        in_map = compose(inverse(self.world_from_map), drop)
         try:
-            mission = fetch_mission(there)
+            mission = fetch_mission(in_map)
             task = await self.accepted(lambda: self.tasks.carry_out(mission, label="fetch"))
             ended = await self.while_running(self.tasks.result(task))
         except (Refused, BodyLost) as refusal:
@@ -205,7 +205,7 @@ class FetchDriver(CourseDriver):
         return "" if ended.state == "succeeded" else ended.reason
 
     def can(self) -> tuple[Floats, float] | None:
-        """Return where the can is (3,) [m], and the cosine of its tilt, by the physics."""
+        """Return the can's true position (3,) [m] and the cosine of its tilt; None if unknown."""
         scene, poses = self._scenes.current, self._sim_poses.current
         if scene is None or poses is None or poses.version != scene.version:
             return None
@@ -223,7 +223,7 @@ async def _fetch(
     world = draw(seed)
     deployment = lock_stepped(body, write(world, folder, people=people), seed, speed)
     course = ClutteredWorld(seed, (), (), (), world.start, (), ())
-    async with measured_robot(deployment, folder, START_S) as (group, bus):
+    async with measured_robot(deployment, folder, START_TIMEOUT_S) as (group, bus):
         driver = FetchDriver(bus, group, course, seconds)
         reason = await driver.fetch(world.drop)
         report = await driver.look()

@@ -1,4 +1,4 @@
-"""`gigabrain bench goals`: a robot explores an unknown world, then is sent to random places."""
+"""`gigabrain bench goals`: a robot explores an unknown world, then drives to random goals."""
 
 import asyncio
 import contextlib
@@ -39,13 +39,13 @@ from gigabrain_zenoh.qa.robot_under_test import (
     rss_mb,
 )
 
-START_S = 600.0  # a robot's processes and its first map, on a busy machine
+START_TIMEOUT_S = 600.0  # for a robot's processes and its first map, on a busy machine
 MIN_REACHED = 0.99  # share of all goals
-CAPACITY_AH = 1000.0  # of a body that drives for hours; a burger's own battery lasts two
-MAX_GOAL_COST = 5.0  # so that the body can turn at a goal
-MAX_SILENCE_S = 60.0  # of the tasks; a busy host may stand still for seconds
+CAPACITY_AH = 1000.0  # battery for runs of many hours; a burger's own one lasts two hours
+MAX_GOAL_COST = 5.0  # low enough that the body can turn at a goal
+MAX_SILENCE_S = 60.0  # of the task queue; a busy host may pause for seconds
 MIN_DISTANCE_M = 1.0  # from the robot to its next goal
-REACHED_M, REACHED_RAD = 0.5, math.radians(15)  # by the physics
+REACHED_M, REACHED_RAD = 0.5, math.radians(15)  # by the true pose
 
 Progress = Callable[[str], None]
 T = TypeVar("T")
@@ -55,11 +55,11 @@ class GoalCourse(Struct, frozen=True, kw_only=True):
     """Goals and duration of a run."""
 
     goals: int
-    meetings: int = 0  # with the person, at least
-    hours: float = 0.0  # of the robot's time, at least
+    meetings: int = 0  # least number, with the person
+    hours: float = 0.0  # least duration, of the robot's time
     speed: float = 5.0
     seed: int = 0
-    headings: bool = False  # all goals have one, and the body's own motions reach them
+    headings: bool = False  # all goals have a heading, and the body's motions can reach them
     link: LinkName = "sim"
     logs: Path | None = None  # folder of the processes' logs
 
@@ -74,14 +74,14 @@ class GoalFailure(Struct, frozen=True, kw_only=True):
 
 
 class GoalError(Struct, frozen=True):
-    """Distance and angle from a goal at rest, by the physics."""
+    """True distance [m] and angle [rad] from a goal at rest."""
 
     m: float
     rad: float | None  # None without a wanted heading
 
 
 def missed_by(off: GoalError) -> str:
-    """Return why a reported goal was not reached; empty if it was."""
+    """Return why a goal that was reported as reached was not; empty if it was."""
     if off.m > REACHED_M:
         return f"reported as reached, {off.m:.2f} m from the goal"
     if off.rad is not None and off.rad > REACHED_RAD:
@@ -95,18 +95,18 @@ class GoalFigures(Struct, frozen=True, kw_only=True):
     body: str
     world: str
     speed: float
-    accepted_s: float  # of the host's time, from the start of the processes to the first task
-    explored: str  # how exploring ended
+    accepted_s: float  # host's time from the start of the processes to the first accepted task
+    explored: str  # end state of exploring
     explored_s: float  # of the robot's time
     goals: int
     reached: int
     off: tuple[GoalError, ...]  # of all goals reported as reached
     contacts: int
     min_clearance_m: float
-    met: int  # stops of the person for the robot
+    met: int  # how often the person stopped for the robot
     distance_m: float
-    seconds: float  # of the robot's time, in all
-    alone: int  # ticks without the brain, on a host too busy for the speed
+    seconds: float  # total, of the robot's time
+    alone: int  # ticks that did not wait for the brain, as the host was too busy
     failures: tuple[GoalFailure, ...]
     growth: MapGrowth  # of perception
 
@@ -146,7 +146,7 @@ class GoalsResult(Struct, frozen=True, kw_only=True):
 async def measure_goals(
     bodies: Sequence[str], worlds: Sequence[str], course: GoalCourse, show: Progress
 ) -> GoalsResult:
-    """Send each body through each world, on the same course.
+    """Run the same course with each body in each world.
 
     Raises GigabrainError when a process dies on the way.
     """
@@ -171,23 +171,25 @@ async def measure_goals(
 
 async def _run(deployment: Deployment, course: GoalCourse, show: Progress) -> GoalFigures:
     """Run one body in one world."""
-    who = deployment.body
-    name = f"{who} in {deployment.world}"
+    body_name = deployment.body
+    name = f"{body_name} in {deployment.world}"
     with _folder(course, name.replace(" ", "-")) as folder:
         if course.hours:
             body = str(with_capacity(robot_path(deployment.body), folder / "body"))
             deployment = msgspec.structs.replace(deployment, body=body)
         poses = None
         if course.headings:
-            robot, place = load_robot(who), load_world(deployment.world, deployment.seed)
+            robot, place = load_robot(body_name), load_world(deployment.world, deployment.seed)
             poses = reachable_poses(robot.description(), place)
             show(f"{name}: {len(poses)} poses that it reaches")
         show(f"{name}: starting")
-        began_s = asyncio.get_running_loop().time()
-        async with measured_robot(deployment, folder, START_S) as (group, bus):
+        begin_s = asyncio.get_running_loop().time()
+        async with measured_robot(deployment, folder, START_TIMEOUT_S) as (group, bus):
             judge = "driver" if deployment.link == "sim" else "emulator"
             sender = GoalSender(bus, group, deployment.seed, poses, judge)
-            await group.until(lambda: sender.is_localized, "a map, and the robot in it", START_S)
+            await group.until(
+                lambda: sender.is_localized, "a map, and the robot in it", START_TIMEOUT_S
+            )
             show(f"{name}: exploring")
             explored = await sender.explore()
             explored_s = sender.seconds
@@ -196,10 +198,10 @@ async def _run(deployment: Deployment, course: GoalCourse, show: Progress) -> Go
                 show(f"{name}: {sender.reached} of {sender.sent} reached")
             report, growth = await sender.report(), sender.growth()
     return GoalFigures(
-        body=who,
+        body=body_name,
         world=deployment.world,
         speed=deployment.speed,
-        accepted_s=round(sender.accepted_s - began_s, 2),
+        accepted_s=round(sender.accepted_s - begin_s, 2),
         explored=explored,
         explored_s=explored_s,
         goals=sender.sent,
@@ -217,7 +219,7 @@ async def _run(deployment: Deployment, course: GoalCourse, show: Progress) -> Go
 
 
 def with_capacity(robot: Path, folder: Path) -> Path:
-    """Copy a robot's folder and give its simulation a large battery; return the new file."""
+    """Copy a robot's folder, with a large battery in its simulation; return the new robot file."""
     shutil.copytree(robot.parent, folder, dirs_exist_ok=True)
     described = yaml.safe_load(robot.read_text("utf-8"))
     described["sim"] = (described.get("sim") or {}) | {"battery_capacity": CAPACITY_AH}
@@ -241,8 +243,8 @@ def _folder(course: GoalCourse, name: str) -> Iterator[Path]:
 class GoalSender:
     """Sends a robot to random goals; every other one has a heading.
 
-    With `poses` (n, 3) in the world, the goals are some of them, all with their heading. The
-    process `judge` reports the truth.
+    With `poses` (n, 3) in the world, the goals are drawn from them, all with a heading. The
+    process `judge` reports the true pose.
     """
 
     def __init__(
@@ -256,10 +258,10 @@ class GoalSender:
         self._reachable, self._judge = poses, judge
         self._bus, self._group, self._tasks = bus, group, Tasks(bus, silent_s=MAX_SILENCE_S)
         self._maps, self._poses, self._bodies = bus.latest(MAP), bus.latest(POSE), bus.latest(BODY)
-        self._states = bus.latest(STATE)  # also sets the boot that all other messages must have
+        self._states = bus.latest(STATE)  # the others accept only messages of its boot
         self._random, self._search = np.random.default_rng(seed), GridSearch()
         self._world_from_map: Pose | None = None
-        self._add_watched = GrowthSampler()
+        self._growth_sampler = GrowthSampler()
         self.sent = self.reached = 0
         self.accepted_s = 0.0  # of the first task, by the host's clock
         self.failures: list[GoalFailure] = []
@@ -277,7 +279,7 @@ class GoalSender:
         return bool(self._maps.current and self._bodies.current and pose and pose.localized)
 
     async def explore(self) -> str:
-        """Explore from the origin of the map; return how that ended, in words."""
+        """Explore from the origin of the map; return the end state and its reason."""
         truth = await self._true_pose()
         self._world_from_map = compose(truth, inverse(self._here()))
         task = await self._tasks.explore()
@@ -286,8 +288,8 @@ class GoalSender:
         return f"{ended.state}: {ended.reason}"
 
     async def send(self) -> None:
-        """Send it to a random goal, and wait for the result."""
-        # a person who blocks all ways walks on after a while
+        """Send the robot to a random goal, and wait for the result."""
+        # retry: a person who blocks all ways walks on after a while
         goal = await self._retried(GigabrainError, self.random_goal)
         self.sent += 1
         reason = await self._go(goal)
@@ -302,7 +304,7 @@ class GoalSender:
             self.reached += 1
 
     async def done(self, goals: int, meetings: int, hours: float) -> bool:
-        """Return whether goals, time and meetings are enough."""
+        """Return whether there were enough goals, hours and meetings."""
         if self.sent < goals or self.seconds < hours * 3600:
             return False
         return not meetings or (await self.report())["person_stood"] >= meetings
@@ -310,16 +312,16 @@ class GoalSender:
     def growth(self) -> MapGrowth:
         """Return the growth of perception's memory and map."""
         assert self._maps.current
-        return self._add_watched.growth(self._maps.current)
+        return self._growth_sampler.growth(self._maps.current)
 
     def _sample(self) -> None:
         """Sample perception once per minute of the robot's time."""
         pid, grid = self._group.supervisor.statuses["perception"].pid, self._maps.current
-        if pid and grid and self.seconds >= (self._add_watched.minutes + 1) * 60:
-            self._add_watched.minute(rss_mb(pid), grid)
+        if pid and grid and self.seconds >= (self._growth_sampler.minutes + 1) * 60:
+            self._growth_sampler.minute(rss_mb(pid), grid)
 
     async def report(self) -> dict[str, float]:
-        """Return the simulation's truth. Raises GigabrainError if it never arrives."""
+        """Return the simulation's true values. Raises GigabrainError if they never arrive."""
         truth: dict[str, float] = {}
         while not truth:
             await self._group.poll()
@@ -328,7 +330,7 @@ class GoalSender:
         return truth
 
     async def _go(self, goal: Goal) -> str:
-        """Drive to a goal; return why it was not reached, empty if it was."""
+        """Drive to a goal; return the reason of a failure, empty on success."""
         try:
             task = await self._send_goal(goal)
             ended = await self._while_running(self._tasks.result(task))
@@ -354,10 +356,10 @@ class GoalSender:
 
     async def _off(self, goal: Goal) -> GoalError:
         assert self._world_from_map
-        there = compose(self._world_from_map, Pose(x=goal.x, y=goal.y, yaw=goal.yaw or 0.0))
+        target = compose(self._world_from_map, Pose(x=goal.x, y=goal.y, yaw=goal.yaw or 0.0))
         truth = await self._true_pose()
-        turn = None if goal.yaw is None else abs(wrap_angle(truth.yaw - there.yaw))
-        return GoalError(math.hypot(truth.x - there.x, truth.y - there.y), turn)
+        turn = None if goal.yaw is None else abs(wrap_angle(truth.yaw - target.yaw))
+        return GoalError(math.hypot(truth.x - target.x, truth.y - target.y), turn)
 
     async def _true_pose(self) -> Pose:
         truth = await self.report()
@@ -369,7 +371,7 @@ class GoalSender:
         return Pose(x=pose.x, y=pose.y, yaw=pose.yaw)
 
     async def random_goal(self) -> Goal:
-        """Return a place that it can reach. Raises GigabrainError where there is none."""
+        """Return a random reachable goal. Raises GigabrainError if there is none."""
         if self._reachable is not None:
             return await self._reachable_goal(self._reachable)
         x, y = await self._random_place()
@@ -384,26 +386,26 @@ class GoalSender:
         if not len(far):
             raise GigabrainError("the body's own motions lead nowhere from where it starts")
         x, y, yaw = far[int(self._random.integers(len(far)))].tolist()
-        there = compose(inverse(self._world_from_map), Pose(x=x, y=y, yaw=yaw))
-        return Goal(x=there.x, y=there.y, yaw=wrap_angle(there.yaw))
+        in_map = compose(inverse(self._world_from_map), Pose(x=x, y=y, yaw=yaw))
+        return Goal(x=in_map.x, y=in_map.y, yaw=wrap_angle(in_map.yaw))
 
     async def _random_place(self) -> Point:
         """Return a reachable place in the map where the body can turn."""
         grid, body, here = self._maps.current, self._bodies.current, self._here()
         assert grid
         assert body
-        made = costmap(grid, inflation(body.description, "forbid"))
-        start = made.cell(here.x, here.y)
+        costs = costmap(grid, inflation(body.description, "forbid"))
+        start = costs.cell(here.x, here.y)
         if start is None:
             raise GigabrainError("the robot is outside its map, so it has no goal")
-        way = self._search.field(made.cost, start, "from") * made.resolution
+        way = self._search.field(costs.cost, start, "from") * costs.resolution
         rows, columns = np.nonzero(
-            (made.cost < MAX_GOAL_COST) & (way > MIN_DISTANCE_M) & np.isfinite(way)
+            (costs.cost < MAX_GOAL_COST) & (way > MIN_DISTANCE_M) & np.isfinite(way)
         )
         if not len(rows):
             raise GigabrainError("no place can be reached from the robot's pose")
         one = int(self._random.integers(len(rows)))
-        x, y = made.points(rows[one : one + 1], columns[one : one + 1])[0].tolist()
+        x, y = costs.points(rows[one : one + 1], columns[one : one + 1])[0].tolist()
         return x, y
 
     async def _while_running(self, work: Awaitable[T]) -> T:
@@ -419,7 +421,7 @@ class GoalSender:
             waiting.cancel()
 
     def _refuse_latched(self) -> None:
-        """Raise GigabrainError where only a person could have the robot drive again."""
+        """Raise GigabrainError if only a person can make the robot drive again."""
         state = self._states.current
         latching = [cause.text for cause in state.gate.causes if cause.latching] if state else []
         if state and state.gate.mode == "latched" and latching:

@@ -1,6 +1,6 @@
-"""`gigabrain bench hands`: an arm picks things up and puts them down, judged by the physics.
+"""`gigabrain bench hands`: an arm picks things up and puts them down; the physics judge it.
 
-Planner, control and gate are those of a robot, stepped in memory on a simulated body.
+Planner, control and gate are the same as on a robot; they run in memory on a simulated body.
 """
 
 import dataclasses
@@ -49,19 +49,19 @@ if TYPE_CHECKING:
 
 KINDS = ("cube", "cylinder", "sphere")
 SIZES_M, MASSES_KG, FRICTIONS = (0.02, 0.04), (0.02, 0.08, 0.2), (0.4, 1.0)
-REACH_M, AROUND_RAD = (0.10, 0.26), math.pi / 2  # from the first joint's axis, to both sides
+REACH_M, AROUND_RAD = (0.10, 0.26), math.pi / 2  # distance from the first joint's axis, and angle
 TALL = 1.2  # length over diameter of a cylinder
-LIFTED_M = 0.01  # from which a thing counts as picked up
-PLACED_M = 0.01  # from its place, within which it counts as put there
+LIFTED_M = 0.01  # least height of a thing that counts as picked up
+PLACED_M = 0.01  # largest error of a thing that counts as placed
 SETTLE_TICKS = 25
-TARGETS = 20  # places that are drawn until one can be reached
-STILL = "0.02 0.0005"  # torsional and rolling friction of things
-SLACK = 0.001  # of a joint's range, beyond which it counts as broken
+TARGETS = 20  # largest number of places to try
+FRICTION_2_3 = "0.02 0.0005"  # torsional and rolling friction of things
+SLACK = 0.001  # share of a joint's range by which it may exceed its limits
 Progress = Callable[[str], None]
 
 
 class HandsRun(Struct, frozen=True, kw_only=True):
-    """One thing."""
+    """The result with one thing."""
 
     seed: int
     kind: str
@@ -69,23 +69,23 @@ class HandsRun(Struct, frozen=True, kw_only=True):
     mass_kg: float
     friction: float
     distance_m: float  # from the first joint's axis
-    outcome: str  # placed, unreachable, or what went wrong
+    outcome: str  # "placed", "unreachable", or the kind of failure
     reason: str = ""
-    off_m: float | None = None  # from its place, by the physics
+    off_m: float | None = None  # true distance from its target
     seconds: float = 0.0  # of the robot's time
-    planning_s: float = 0.0  # of wall time
-    fastest: float = 0.0  # joint's speed over its greatest, by the physics
-    broken_limits: int = 0  # ticks in which a joint was too far or too fast, by the physics
-    seen_off_m: float | None = None  # of where the camera saw it last, by the physics
+    planning_s: float = 0.0  # wall time
+    fastest: float = 0.0  # highest true speed of a joint, as a share of its limit
+    broken_limits: int = 0  # ticks with a joint beyond its range, by the physics
+    seen_off_m: float | None = None  # error of the position that was seen last
 
 
 class HandsResult(Struct, frozen=True, kw_only=True):
-    """All things."""
+    """The results with all things."""
 
     body: str
     backlash_deg: float = 0.0
     runs: tuple[HandsRun, ...]
-    camera: bool = False  # it knew of things only what a camera sees
+    camera: bool = False  # things were found by a camera
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -103,11 +103,11 @@ class Drawn:
 
     @property
     def height(self) -> float:
-        """Of its middle above the table [m]."""
+        """Height of its middle above the table [m]."""
         return self.size * (TALL if self.kind == "cylinder" else 1.0) / 2
 
     def thing(self) -> Thing:
-        """Return it as the planner knows it."""
+        """Return it for the planner."""
         cos, sin = math.cos(self.yaw), math.sin(self.yaw)
         radius, tall = self.size / 2, 2 * self.height
         sizes = {"cube": (self.size,) * 3, "cylinder": (radius, tall), "sphere": (radius,)}
@@ -120,7 +120,7 @@ class Drawn:
         )
 
     def mjcf(self) -> str:
-        """Return it on a floor, as the physics knows it."""
+        """Return it on a floor, as an MJCF model."""
         half = self.size / 2
         sizes = {"cube": (half,) * 3, "cylinder": (half, self.height), "sphere": (half,)}
         kind = "box" if self.kind == "cube" else self.kind
@@ -131,12 +131,12 @@ class Drawn:
           <body name="thing" pos="{self.x} {self.y} {self.height}" euler="0 0 {yaw}">
             <freejoint/>
             <geom type="{kind}" size="{size}" mass="{self.mass}" condim="6"
-              friction="{self.friction} {STILL}"/>
+              friction="{self.friction} {FRICTION_2_3}"/>
           </body></worldbody></mujoco>"""
 
 
 def draw(rng: np.random.Generator, pan: float) -> Drawn:
-    """Draw a thing on the table; `pan` is where the first joint's axis is along x [m]."""
+    """Draw a thing on the table; `pan` is the x of the first joint's axis [m]."""
     distance = float(rng.uniform(*REACH_M))
     angle = float(rng.uniform(-AROUND_RAD, AROUND_RAD))
     return Drawn(
@@ -152,12 +152,12 @@ def draw(rng: np.random.Generator, pan: float) -> Drawn:
 
 
 def pan_axis(arm: ArmKinematics) -> float:
-    """Return where the axis of the first joint is along x [m]."""
+    """Return the x of the first joint's axis [m]."""
     return float(arm.chain.fixed[0, 0, 3])
 
 
 class ArmInMemory:
-    """A simulated arm behind the gate, with control; the brain is whoever calls it."""
+    """A simulated arm behind the gate, with control. The caller is the brain."""
 
     def __init__(self, robot: RobotFile, body: SimModel, world: Path) -> None:
         self.robot, self.description = robot, robot.description()
@@ -169,7 +169,7 @@ class ArmInMemory:
         )
         self._gate, self._memory, self._seq = gate.GateState(boot=1), JointMemory(), 0
         self.broken, self.ticks, self.fastest = 0, 0, 0.0
-        self.caps: tuple[JointCap, ...] = ()  # that safety sets
+        self.caps: tuple[JointCap, ...] = ()  # set by safety
         while self._gate.mode != "enabled":
             self.step(Intent(behaviour="hands", reason="waiting"))
 
@@ -181,7 +181,7 @@ class ArmInMemory:
         )
 
     def step(self, intent: Intent) -> None:
-        """Have 20 ms pass: gate, control, gate, servos, physics."""
+        """Step 20 ms: gate, control, gate, servos, physics."""
         state = self.state()
         joints = tuple(JointMotion(joint.position, joint.velocity) for joint in state.joints)
         self._feed(gate.Tick(ZERO, joints=joints, held=state.joints_sent))
@@ -205,7 +205,7 @@ class ArmInMemory:
         self.broken += self._breaks()
 
     def carry_out(self, phase: Phase) -> None:
-        """Carry out one phase of a plan."""
+        """Execute one phase of a plan."""
         run = PhaseRun([phase], self.description.joints[-1].name, self._gate.tick)
         while not run.advance(self._gate.tick):
             joints, window = run.wish(self._gate.tick)
@@ -214,26 +214,26 @@ class ArmInMemory:
             )
 
     def carry_out_all(self, phases: Sequence[Phase]) -> None:
-        """Carry out the phases of a plan."""
+        """Execute the phases of a plan."""
         for phase in phases:
             self.carry_out(phase)
 
     def settle(self) -> None:
-        """Hold still."""
+        """Wait at rest for SETTLE_TICKS."""
         for _ in range(SETTLE_TICKS):
             self.step(Intent(behaviour="hands", reason="done"))
 
     def posture(self, names: Sequence[str]) -> Floats:
-        """Return the positions of some joints, as they were sent [rad] or [m]."""
+        """Return the newest goals of some joints [rad] or [m]."""
         sent = dict(zip(self.arm.names, self.arm.targets, strict=True))
         return np.array([sent[name] for name in names])
 
     def measured(self, name: str) -> float:
-        """Return where a joint is [rad] or [m]."""
+        """Return the measured position of a joint [rad] or [m]."""
         return next(motor.position for motor in self.arm.motors() if motor.name == name)
 
     def thing(self) -> Floats:
-        """Return where the thing is (3,) [m], by the physics."""
+        """Return the true position of the thing (3,) [m]."""
         model, data = self.simulation.model, self.simulation.data
         return np.array(data.xpos[model.body("world/thing").id])
 
@@ -241,7 +241,7 @@ class ArmInMemory:
         self._gate, _ = gate.step(self._gate_config, self._gate, event)
 
     def _breaks(self) -> bool:
-        """Return whether a joint is beyond its range or its speed, by the physics."""
+        """Return whether a joint is truly beyond its range; record the highest speed."""
         for joint, position, speed in zip(self.description.joints, *self.arm.truth(), strict=True):
             slack = SLACK * (joint.upper - joint.lower)
             self.fastest = max(self.fastest, abs(speed) / joint.max_speed)
@@ -251,7 +251,7 @@ class ArmInMemory:
 
 
 def arm_before(drawn: Drawn, robot: RobotFile, model: SimModel) -> ArmInMemory:
-    """Return an arm before a thing on a table."""
+    """Return an arm with a thing on a table in front of it."""
     with tempfile.TemporaryDirectory(prefix="gigabrain-") as folder:
         (Path(folder) / "thing.xml").write_text(drawn.mjcf())
         world = Path(folder) / "world.yaml"
@@ -260,7 +260,7 @@ def arm_before(drawn: Drawn, robot: RobotFile, model: SimModel) -> ArmInMemory:
 
 
 def with_backlash(model: SimModel, backlash: float) -> SimModel:
-    """Return a body whose joints that turn are free to move by `backlash` [rad]."""
+    """Return a body with `backlash` [rad] in its turning joints."""
     servos = {
         joint.name: msgspec.structs.replace(
             model.servos.get(joint.name, SimServo()), backlash=backlash
@@ -279,10 +279,10 @@ def measure_hands(
     backlash_deg: float = 0.0,
     camera: bool = False,
 ) -> HandsResult:
-    """Have an arm pick one thing up for each seed, and put it down elsewhere.
+    """Let an arm pick up one thing for each seed, and put it down elsewhere.
 
-    With `camera` it knows of the thing only what its first camera sees. Raises ConfigError for a
-    body that has no arm in MuJoCo, or no such camera.
+    With `camera`, its first camera finds the thing. Raises ConfigError for a body without an arm in
+    MuJoCo, or without a camera.
     """
     robot, _, options, folder = load_link(body, Run(folder=Path(), cameras=camera))
     if robot.arm is None or not isinstance(options, MujocoOptions):
@@ -299,7 +299,7 @@ def measure_hands(
 
 
 def in_words(run: HandsRun) -> str:
-    """Return what came of one thing."""
+    """Return the result with one thing as text."""
     what = f"{run.kind} {run.size_m * 100:.1f} cm, {run.mass_kg * 1000:.0f} g"
     where = f"{run.distance_m * 100:.0f} cm away"
     off = "" if run.off_m is None else f", {run.off_m * 100:.1f} cm off"
@@ -312,12 +312,12 @@ class Attempt:
 
     outcome: str = ""
     reason: str = ""
-    target: Floats | None = None  # (3,) [m], where it was to be put
+    target: Floats | None = None  # (3,) [m], where it was put down
     planning_s: float = 0.0
     seen_off: float | None = None  # [m]
 
     def end(self, outcome: str, reason: str = "") -> None:
-        """Record how it ended."""
+        """Record the outcome."""
         self.outcome, self.reason = outcome, reason
 
 
@@ -349,7 +349,7 @@ def _run(seed: int, robot: RobotFile, model: SimModel) -> HandsRun:
 
 
 def _seen(arm: ArmInMemory, planner: ArmPlanner, camera: "ArmCamera") -> Thing | None:
-    """Return the nearest thing that the camera sees; the arm moves out of its sight for that."""
+    """Return the nearest thing that the camera sees; the arm moves out of its view."""
     lookout = Lookout()
     while not (seen := camera.look(arm.state())):
         posture = lookout.aside(arm.description)
@@ -370,7 +370,7 @@ def _pick_and_place(
     rng: np.random.Generator,
     attempt: Attempt,
 ) -> None:
-    """Pick the thing up and put it down where a place can be reached; fill in what came of it."""
+    """Pick the thing up and put it down at a reachable place; fill in the attempt."""
     names = planner.arm.names
     hold = _picked(arm, planner, look, drawn, attempt)
     if hold is None:
@@ -397,16 +397,16 @@ def _picked(
     drawn: Drawn,
     attempt: Attempt,
 ) -> Hold | None:
-    """Return what the gripper holds after a few tries, as decision would try."""
+    """Pick the thing up with as many tries as decision has; return the hold, or None."""
     for misses in range(TRIES):
         thing = look()
         if thing is None:
             attempt.end("not seen")
             return None
         attempt.seen_off = float(np.hypot(*(thing.position - arm.thing())[:2]))
-        began = time.monotonic()
+        begin_s = time.monotonic()
         pick = planner.pick(thing, [], arm.posture(planner.arm.names), misses)
-        attempt.planning_s = time.monotonic() - began
+        attempt.planning_s = time.monotonic() - begin_s
         if isinstance(pick, NoWay):
             attempt.end("not gripped" if misses else "unreachable", pick.reason)
             return None
@@ -420,7 +420,7 @@ def _picked(
 
 
 def _gripped(arm: ArmInMemory, planner: ArmPlanner, pick: Plan, thing: Thing) -> Hold | None:
-    """Carry out a pick; return what is held, or None as soon as nothing is."""
+    """Execute a pick; return the hold, or None as soon as the gripper is empty."""
     assert pick.hold
     assert planner.arm.gripper
     gripper, hold = planner.arm.gripper.name, pick.hold
@@ -440,7 +440,7 @@ def _gripped(arm: ArmInMemory, planner: ArmPlanner, pick: Plan, thing: Thing) ->
 
 
 def _squeezed(arm: ArmInMemory, planner: ArmPlanner, hold: Hold, gripper: str) -> Hold:
-    """Have a gripper squeeze as it should while the arm moves, as decision does."""
+    """Adjust the gripper's force for a moving arm, like decision."""
     while True:
         place = planner.squeeze(arm.measured(gripper), hold.grip, moving=True)
         if place == hold.grip:

@@ -16,14 +16,14 @@ from gigabrain_zenoh.vision.camera_model import CameraModel
 from gigabrain_zenoh.vision.depth_picture import DepthCamera
 from gigabrain_zenoh.vision.solids import find_solids, is_gone
 
-PICTURES = 5  # that are taken of one place
+PICTURES = 5  # per look
 
 
 class ArmCamera:
     """The first camera of a simulated arm."""
 
     def __init__(self, body: BodyDescription, mjcf: str, simulation: Simulation, seed: int) -> None:
-        """Draw by its own graphics. Raises ConfigError where nothing can be drawn."""
+        """Open its own graphics. Raises ConfigError if rendering is impossible."""
         camera = body.cameras[0]
         self._name, self._mask = camera.name, ArmMask(mjcf, body)
         self._scene = SceneWriter(simulation.model, simulation.data, "table")
@@ -33,7 +33,7 @@ class ArmCamera:
         self._memory, self._number = SolidMemory(), 0
 
     def look(self, state: RobotState) -> tuple[SeenSolid, ...]:
-        """Return what is seen after some pictures of a robot at rest."""
+        """Return the solids that are seen in some pictures by a robot at rest."""
         joints = {one.name: one.position for one in state.joints}
         for _ in range(PICTURES):
             self._number += 1

@@ -21,10 +21,10 @@ from gigabrain_schemas.base import Pose, Velocity
 from gigabrain_schemas.body import Lidar as LidarDescription
 from gigabrain_zenoh.qa.bench.barn_course import FIELD_OF_VIEW_RAD, Conditions, JackalBody
 
-PHYSICS_STEPS = 4  # in 10 ms: two for each new command of the motors
+PHYSICS_STEPS = 4  # per 10 ms, two for each new motor command
 WHEEL_RADIUS_M, TRACK_M = 0.098, 0.37559  # [m]
-TRACK_FACTOR = 1.5  # of its maker: the wheels turn more than rolling wheels would
-POST_HEIGHT_M, WALLS_M = 1.0, 50.0  # [m], of the posts, and to the walls that every world has
+TRACK_FACTOR = 1.5  # from the maker: skidding wheels turn farther than rolling ones
+POST_HEIGHT_M, WALLS_M = 1.0, 50.0  # height of posts, and distance of the outer walls
 LEFT = (f"{ROBOT}front_left", f"{ROBOT}rear_left")
 RIGHT = (f"{ROBOT}front_right", f"{ROBOT}rear_right")
 
@@ -47,7 +47,7 @@ class MujocoJackal(JackalBody):
         self._place = int(self._model.joint(f"{ROBOT}free").qposadr[0])
         self._gyro = int(self._model.sensor(f"{ROBOT}gyro").adr[0]) + 2
         self._lidar: Lidar | None = None
-        self._target = (0.0, 0.0)  # of the motors: forward [m/s], turning [rad/s]
+        self._target = (0.0, 0.0)  # motors' target: forward [m/s], turning [rad/s]
         mujoco.mj_forward(self._model, self._data)
 
     @property
@@ -92,8 +92,8 @@ class MujocoJackal(JackalBody):
             )
             self._lidar = Lidar(config, self._model, f"{ROBOT}lidar", self._random)
         angles = np.linspace(-FIELD_OF_VIEW_RAD / 2, FIELD_OF_VIEW_RAD / 2, lidar.beams)
-        ways = np.stack((np.cos(angles), np.sin(angles), np.zeros_like(angles)), axis=1)
-        ranges = self._lidar.cast(self._data, ways)
+        directions = np.stack((np.cos(angles), np.sin(angles), np.zeros_like(angles)), axis=1)
+        ranges = self._lidar.cast(self._data, directions)
         ranges[self._random.random(lidar.beams) < self._conditions.dropouts] = np.inf
         return ranges
 

@@ -1,7 +1,7 @@
-"""`gigabrain bench joints`: how well each joint of an arm follows a sine and a step.
+"""`gigabrain bench joints`: tracking errors of each joint of an arm, on a sine and a step.
 
-The arm is stretched out, where its weight pulls most, and carries a load. Control and gate are
-those of a robot, stepped in memory on a simulated body; the physics tells where the joints are.
+The arm is in the posture with the largest gravity efforts, and carries a load. Control and gate are
+the same as on a robot; they run in memory on a simulated body. The physics give true positions.
 """
 
 import dataclasses
@@ -26,12 +26,12 @@ from gigabrain_zenoh.manipulation.collision import CollisionChecker
 from gigabrain_zenoh.manipulation.inverse_kinematics import spread
 from gigabrain_zenoh.qa.bench.hands import ArmInMemory, with_backlash
 
-SINE_HZ, PERIODS, SKIPPED = 0.5, 5, 1  # periods in all, of which the first do not count
-SPEED_SHARE = 0.5  # of the joint's greatest speed, at the middle of the sine
+SINE_HZ, PERIODS, SKIPPED = 0.5, 5, 1  # periods in total, and at the start without measurement
+SPEED_SHARE = 0.5  # of the joint's top speed, at the middle of the sine
 SPARE_RAD = 0.03  # between the sine and the ends of the joint's range
-WINDOW_TICKS = 100  # of a trajectory, as decision sends it
+WINDOW_TICKS = 100  # length of a trajectory in an intent, like decision's
 SETTLE_TICKS = 150  # 3 s
-POSTURES = 3000  # of which the arm is stretched out in one
+POSTURES = 3000  # candidates for the stretched posture
 LOW_FLOOR = """<mujoco><worldbody>
   <geom name="floor" type="plane" size="2 2 .1" pos="0 0 -2"/></worldbody></mujoco>"""
 LOAD = {"type": "sphere", "size": "0.015", "contype": "0", "conaffinity": "0", "group": "2"}
@@ -39,19 +39,19 @@ Progress = Callable[[str], None]
 
 
 class JointTracking(Struct, frozen=True, kw_only=True):
-    """The errors of one joint that follows a sine and a step, by the physics."""
+    """The true errors of one joint that follows a sine and a step."""
 
     joint: str
     amplitude_deg: float  # of the sine
-    rms_deg: float  # off the sine
+    rms_deg: float  # error on the sine
     worst_deg: float
-    lag_ms: float  # by which it comes after the sine
+    lag_ms: float  # delay behind the sine
     overshoot: float  # share of the step
-    rest_deg: float  # off the step's end, at rest
+    rest_deg: float  # error at rest, after the step
 
 
 class TrackingResult(Struct, frozen=True, kw_only=True):
-    """All joints of an arm."""
+    """The errors of all joints of an arm."""
 
     body: str
     load_kg: float
@@ -62,7 +62,7 @@ class TrackingResult(Struct, frozen=True, kw_only=True):
 def measure_joints(
     body: str, load_kg: float, backlash_deg: float, show: Progress
 ) -> TrackingResult:
-    """Have each joint of an arm follow a sine and a step. Raises ConfigError without an arm."""
+    """Let each joint of an arm follow a sine and a step. Raises ConfigError without an arm."""
     robot, _, options, folder = load_link(body, Run(folder=Path()))
     if robot.arm is None or not isinstance(options, MujocoOptions):
         raise ConfigError(f"{body} has no arm in MuJoCo; choose so101 or piper")
@@ -85,7 +85,7 @@ def measure_joints(
 
 
 def loaded(model: SimModel, tool: str, load_kg: float) -> SimModel:
-    """Return a body with a load at its tool that touches nothing."""
+    """Return a body with a load at its tool; the load has no contacts."""
     if not load_kg:
         return model
     root = xml.fromstring(model.model)
@@ -99,15 +99,15 @@ def loaded(model: SimModel, tool: str, load_kg: float) -> SimModel:
 
 
 def amplitudes(arm: ArmKinematics) -> Floats:
-    """Return how far each joint swings (n,) [rad], so that its speed is half of the greatest."""
+    """Return the amplitude (n,) [rad] at which each joint reaches half its top speed."""
     speeds = np.array([SPEED_SHARE * joint.max_speed for joint in arm.joints])
     return np.asarray(speeds / (math.tau * SINE_HZ))
 
 
 def stretched(arm: ArmKinematics) -> Floats:
-    """Return the posture (n,) in which the arm's weight pulls most; each joint may swing there.
+    """Return the posture (n,) with the largest gravity efforts in which each joint can swing.
 
-    Raises ConfigError for an arm that has none.
+    Raises ConfigError if there is none.
     """
     swings = amplitudes(arm)
     low, high = arm.lower + swings + SPARE_RAD, arm.upper - swings - SPARE_RAD
@@ -125,7 +125,7 @@ def stretched(arm: ArmKinematics) -> Floats:
 
 
 class Trial:
-    """One joint of an arm that swings, while the others hold."""
+    """One joint of an arm moves, while the others hold their positions."""
 
     def __init__(
         self, arm: ArmInMemory, kinematics: ArmKinematics, posture: Floats, number: int
@@ -136,18 +136,18 @@ class Trial:
         self._swing = float(amplitudes(kinematics)[number])
 
     def run(self) -> JointTracking:
-        """Measure a sine, and a step from one of its ends to the other."""
+        """Measure a sine, and a step between its extremes."""
         low, high = (float(self._posture[self._number]) + way * self._swing for way in (-1.0, 1.0))
         self._go_to(low)
         wanted, measured = self._sine(low)
-        off = np.degrees(measured - wanted)
+        error_deg = np.degrees(measured - wanted)
         self._go_to(low)
         step = np.array(list(self._stepped(high)))
         return JointTracking(
             joint=self._name,
             amplitude_deg=math.degrees(self._swing),
-            rms_deg=float(np.sqrt((off**2).mean())),
-            worst_deg=float(np.abs(off).max()),
+            rms_deg=float(np.sqrt((error_deg**2).mean())),
+            worst_deg=float(np.abs(error_deg).max()),
             lag_ms=_lag_s(wanted, measured) * 1000,
             overshoot=max(0.0, float(step.max() - high) / (high - low)),
             rest_deg=math.degrees(abs(float(step[-1]) - high)),
@@ -158,7 +158,7 @@ class Trial:
         return places[self._name]
 
     def _go_to(self, place: float) -> None:
-        """Have the arm be in its posture, with the joint at `place`, and rest there."""
+        """Bring the arm to rest in its posture, with the joint at `place` [rad]."""
         wanted = self._postured(place)
         before = self._arm.posture(self._kinematics.names)
         for share in np.linspace(0.0, 1.0, SETTLE_TICKS):
@@ -167,19 +167,19 @@ class Trial:
             self._step_to(self._named(wanted))
 
     def _stepped(self, place: float) -> Iterator[float]:
-        """Yield where the joint is while it goes to a place as fast as control takes it."""
+        """Yield the joint's true position [rad] while it steps to `place` at full speed."""
         wanted = self._named(self._postured(place))
         for _ in range(SETTLE_TICKS):
             self._step_to(wanted)
             yield self._truth()
 
     def _sine(self, low: float) -> tuple[Floats, Floats]:
-        """Return where the joint should be and where it was, in the periods that count."""
+        """Return the wanted and the true positions [rad], in the periods that count."""
         period = round(1 / (SINE_HZ * TICK_S))
         angles = np.arange(PERIODS * period + WINDOW_TICKS) * math.tau / period
         way = low + self._swing * (1.0 - np.cos(angles))
         measured = []
-        first = self._arm.state().tick + 1  # of the state that the next step begins with
+        first = self._arm.state().tick + 1  # tick of the next step's first state
         for tick in range(PERIODS * period):
             window = JointTrajectory(
                 name=(self._name,), start=first + tick, period=TICK_S,
@@ -204,7 +204,7 @@ class Trial:
 
 
 def _lag_s(wanted: Floats, measured: Floats) -> float:
-    """Return by how much a measured sine comes after the wanted one [s]."""
+    """Return the delay of a measured sine behind the wanted one [s]."""
     angles = np.arange(len(wanted)) * TICK_S * math.tau * SINE_HZ
     turns = np.exp(-1j * angles)
     phase = np.angle((measured * turns).sum() / (wanted * turns).sum())

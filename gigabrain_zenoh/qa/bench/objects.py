@@ -1,4 +1,4 @@
-"""`gigabrain bench objects`: what a robot remembers of the things in a room, against the truth."""
+"""`gigabrain bench objects`: compares a robot's remembered objects with the true ones in a room."""
 
 import json
 import math
@@ -15,16 +15,16 @@ from gigabrain_schemas.objects import MapObject
 from gigabrain_schemas.topics import OBJECT_MAP
 from gigabrain_zenoh.geometry.pose import to_parent
 from gigabrain_zenoh.navigation.global_planner import warm_up
-from gigabrain_zenoh.qa.bench.clutter import START_S, CourseDriver, lock_stepped
+from gigabrain_zenoh.qa.bench.clutter import START_TIMEOUT_S, CourseDriver, lock_stepped
 from gigabrain_zenoh.qa.bench.cluttered_worlds import ClutteredWorld, Point
 from gigabrain_zenoh.qa.robot_under_test import measured_robot
 from gigabrain_zenoh.qa.train.looks import MAKERS, Geom, Look
 
-CLASSES = ("cube", "ball", "cylinder", "can", "box")  # things that stay where they are
-HALF_M = 2.6  # of the room
+CLASSES = ("cube", "ball", "cylinder", "can", "box")
+HALF_M = 2.6  # half the room's width
 THINGS, GOALS = 7, 8
 GAP_M, GOAL_GAP_M, START_GAP_M = 0.7, 0.45, 0.8  # between things; from a goal, and from the start
-SAME_M = 0.3  # from the truth, within which a remembered thing is taken for it
+SAME_M = 0.3  # largest distance of a remembered thing from the true one
 COLOURS = ((0.75, 0.2, 0.15), (0.15, 0.35, 0.7), (0.9, 0.7, 0.2), (0.2, 0.55, 0.3), (0.8, 0.8, 0.8))
 CARTON = (0.68, 0.5, 0.33)
 GEOMS = ("box", "cylinder", "sphere", "capsule", "ellipsoid")
@@ -42,19 +42,19 @@ class Placed:
 
 
 class ObjectRun(Struct, frozen=True, kw_only=True):
-    """One world."""
+    """The result of one world."""
 
     seed: int
     things: tuple[str, ...]  # classes
-    found: tuple[bool, ...]  # of each, whether it is remembered as what it is
-    errors_m: tuple[float, ...]  # of those found
-    false: tuple[str, ...]  # classes of what is remembered and is not there
-    goals: int  # reached
+    found: tuple[bool, ...]  # for each, whether it is remembered with its class
+    errors_m: tuple[float, ...]  # position errors of the found ones
+    false: tuple[str, ...]  # classes of remembered things that do not exist
+    goals: int  # number of reached goals
     contacts: int
 
 
 class ObjectsResult(Struct, frozen=True, kw_only=True):
-    """All worlds."""
+    """The results of all worlds."""
 
     body: str
     speed: float
@@ -64,7 +64,7 @@ class ObjectsResult(Struct, frozen=True, kw_only=True):
 async def measure_objects(
     seeds: Sequence[int], body: str, speed: float, seconds: float, show: Progress
 ) -> ObjectsResult:
-    """Drive a robot with cameras to eight places of each world, and compare what it remembers.
+    """Drive a robot with cameras to eight places in each world, and judge its object map.
 
     Raises GigabrainError when a process dies.
     """
@@ -78,7 +78,7 @@ async def measure_objects(
 
 
 def in_words(run: ObjectRun) -> str:
-    """Return what came of one world."""
+    """Return the result of one world as text."""
     missed = [one for one, found in zip(run.things, run.found, strict=True) if not found]
     text = f"world {run.seed}: {sum(run.found)} of {len(run.found)} things"
     if run.errors_m:
@@ -91,20 +91,20 @@ def in_words(run: ObjectRun) -> str:
 async def _drive(seed: int, body: str, speed: float, seconds: float, folder: Path) -> ObjectRun:
     placed, course = draw(seed)
     deployment = lock_stepped(body, write(course, placed, folder), seed, speed)
-    async with measured_robot(deployment, folder, START_S) as (group, bus):
+    async with measured_robot(deployment, folder, START_TIMEOUT_S) as (group, bus):
         objects = bus.latest(OBJECT_MAP)
-        driven = CourseDriver(bus, group, course, seconds)
-        await driven.drive()
-        report = await driven.look()
+        driver = CourseDriver(bus, group, course, seconds)
+        await driver.drive()
+        report = await driver.look()
         remembered = objects.current.objects if objects.current else ()
-    found, errors, false = judged(placed, remembered, driven.world_from_map)
+    found, errors, false = judged(placed, remembered, driver.world_from_map)
     return ObjectRun(
         seed=seed,
         things=tuple(one.look.label for one in placed),
         found=found,
         errors_m=errors,
         false=false,
-        goals=driven.reached,
+        goals=driver.reached,
         contacts=int(report["contacts"]),
     )
 
@@ -112,9 +112,9 @@ async def _drive(seed: int, body: str, speed: float, seconds: float, folder: Pat
 def judged(
     placed: Sequence[Placed], remembered: Sequence[MapObject], world_from_map: Pose
 ) -> tuple[tuple[bool, ...], tuple[float, ...], tuple[str, ...]]:
-    """Return which things are remembered, the errors of those [m], and what is not there.
+    """Return for each thing whether it is found, the errors [m], and the false classes.
 
-    `world_from_map` is the map's origin in the world.
+    `world_from_map` is the pose of the map in the world.
     """
     left = [(one.label, to_parent(world_from_map, one.x, one.y)) for one in remembered]
     found, errors = [], []
@@ -133,7 +133,7 @@ def judged(
 
 
 def draw(seed: int) -> tuple[tuple[Placed, ...], ClutteredWorld]:
-    """Return the things of a seed's world, and start and goals in it."""
+    """Return the things in the world of a seed, and its start and goals."""
     random = np.random.default_rng(np.random.SeedSequence((seed, 1801)))
     start = Pose(x=0.0, y=0.0, yaw=float(random.uniform(-math.pi, math.pi)))
     placed: list[Placed] = []
@@ -159,7 +159,7 @@ def _away(x: float, y: float, placed: Sequence[Placed]) -> float:
 
 
 def write(course: ClutteredWorld, placed: Sequence[Placed], folder: Path) -> Path:
-    """Write a world file and its model; return the former."""
+    """Write the world file and its model; return the path of the world file."""
     random = np.random.default_rng(course.seed)
     bodies = [_mjcf(number, one, random) for number, one in enumerate(placed)]
     model = f"<mujoco><worldbody>{''.join(bodies)}</worldbody></mujoco>\n"

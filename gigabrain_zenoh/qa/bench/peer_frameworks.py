@@ -1,7 +1,7 @@
-"""The bare relay with the means of dora and of ROS 1, for `bench chain --peers`.
+"""The bare relay built with dora and with ROS 1, for `bench chain --peers`.
 
-Each needs its command on the PATH: `dora`, or `rosmaster`. The interpreter of that command runs the
-four processes.
+Each needs its command on the PATH: `dora` or `rosmaster`. The Python interpreter of that command
+runs the four processes.
 """
 
 import asyncio
@@ -27,17 +27,17 @@ from gigabrain_zenoh.qa.probe import until
 NODE = Path(__file__).parent / "peer_node.py"
 NAMES = ("source", "first", "second", "third")
 COMMANDS = {"dora": "dora", "rospy": "rosmaster"}
-START_S, END_S = 20.0, 3.0
+START_TIMEOUT_S, END_TIMEOUT_S = 20.0, 3.0
 LOCAL = "127.0.0.1"
 Role = dict[str, Any]
 
 
 class Framework(NamedTuple):
-    """A framework that is installed."""
+    """An installed framework."""
 
     name: str  # "dora"
     command: str
-    python: str  # the interpreter that has it
+    python: str  # interpreter that can import it
 
 
 def installed() -> tuple[Framework, ...]:
@@ -57,7 +57,7 @@ def _interpreter(script: str) -> str:
 async def time_framework(
     framework: Framework, rate_hz: float, seconds: float, settle_s: float, sizes: Sequence[int]
 ) -> Latencies:
-    """Time its four processes. Raises GigabrainError when they do not come to an end."""
+    """Time its four processes. Raises GigabrainError when they do not finish."""
     with tempfile.TemporaryDirectory(prefix="gigabrain-bench-") as name:
         folder = Path(name)
         result, log = folder / "times.json", folder / "log"
@@ -72,10 +72,10 @@ async def time_framework(
         with log.open("wb") as output:
             async with _RUNS[framework.name](framework, role, folder, output.fileno()):
                 try:
-                    await until(result.exists, "times", START_S + settle_s + seconds)
+                    await until(result.exists, "times", START_TIMEOUT_S + settle_s + seconds)
                 except Failed as error:
-                    said = log.read_text(errors="replace").splitlines()[-1:]
-                    raise Failed(f"{framework.name}: {error}; {''.join(said)}") from None
+                    last_line = log.read_text(errors="replace").splitlines()[-1:]
+                    raise Failed(f"{framework.name}: {error}; {''.join(last_line)}") from None
         return latencies(msgspec.json.decode(result.read_bytes()))
 
 
@@ -106,18 +106,18 @@ async def _rospy(
     framework: Framework, role: Role, folder: Path, output: int
 ) -> AsyncIterator[None]:
     port = reserve_port(LOCAL)
-    own = {
+    variables = {
         "ROS_MASTER_URI": f"http://{LOCAL}:{port}", "ROS_IP": LOCAL,
         "ROS_HOME": str(folder), "ROS_LOG_DIR": str(folder),
     }  # fmt: skip
     async with contextlib.AsyncExitStack() as stack:
         master = [framework.command, "--core", "-p", str(port)]
-        await stack.enter_async_context(_running(master, folder, output, own))
-        await until(lambda: _listens(port), "rosmaster", START_S)
+        await stack.enter_async_context(_running(master, folder, output, variables))
+        await until(lambda: _listens(port), "rosmaster", START_TIMEOUT_S)
         for index in range(len(NAMES)):
             words = msgspec.json.encode(role | {"index": index}).decode()
             node = [framework.python, str(NODE), words]
-            await stack.enter_async_context(_running(node, folder, output, own))
+            await stack.enter_async_context(_running(node, folder, output, variables))
         yield
 
 
@@ -128,16 +128,16 @@ def _listens(port: int) -> bool:
 
 @asynccontextmanager
 async def _running(
-    command: Sequence[str], folder: Path, output: int, own: Mapping[str, str] | None = None
+    command: Sequence[str], folder: Path, output: int, variables: Mapping[str, str] | None = None
 ) -> AsyncIterator[None]:
-    """Run a process in a session of its own until the end of the block; end all that it started."""
+    """Run a process in its own session; at the end of the block, end all of its children too."""
     process = await asyncio.create_subprocess_exec(
         *command,
         stdin=asyncio.subprocess.DEVNULL,
         stdout=output,
         stderr=output,
         cwd=folder,
-        env={**os.environ, **(own or {})},
+        env={**os.environ, **(variables or {})},
         start_new_session=True,
     )
     try:
@@ -147,7 +147,7 @@ async def _running(
             with contextlib.suppress(ProcessLookupError):
                 os.killpg(process.pid, sign)
             with contextlib.suppress(TimeoutError):
-                async with asyncio.timeout(END_S):
+                async with asyncio.timeout(END_TIMEOUT_S):
                     await process.wait()
 
 

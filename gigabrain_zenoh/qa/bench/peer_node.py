@@ -1,8 +1,8 @@
-"""One process of the bare relay with the means of dora or ROS 1, for `bench chain --peers`.
+"""One process of the bare relay, built with dora or ROS 1, for `bench chain --peers`.
 
-Started as `python peer_node.py ROLE` by the interpreter that has dora or rospy, so it imports
-nothing of ours. ROLE is JSON: `system`, `index` (0 for the source), `sizes` of the messages, and of
-the source also `rate_hz`, `settle_s`, `seconds` and `result`, the file for its times [ms].
+An interpreter with dora or rospy runs `python peer_node.py ROLE`, so it imports nothing of ours.
+ROLE is JSON: `system`, `index` (0 for the source) and `sizes` of the messages. For the source it
+also has `rate_hz`, `settle_s`, `seconds` and `result`, the file for its times [ms].
 """
 
 import json
@@ -18,16 +18,16 @@ LOST_S = 0.3  # later messages count as lost
 
 
 class Source:
-    """Fills in messages, and times those that come back."""
+    """Creates messages, and measures the time until they come back."""
 
     def __init__(self, role: dict[str, Any]) -> None:
         self._role, self._filler = role, bytes(role["sizes"][0] - STAMP_BYTES)
         self._times_ms: list[float] = []
-        self._begin = math.inf  # of the clock that counts, when the first message came back
+        self._begin = math.inf  # time of the first message that came back [s]
 
     @property
     def over(self) -> bool:
-        """Return whether the last message should have come back."""
+        """True when no more messages are expected."""
         whole_s: float = self._role["settle_s"] + self._role["seconds"] + LOST_S
         return time.monotonic() - self._begin > whole_s
 
@@ -36,7 +36,7 @@ class Source:
         return time.monotonic_ns().to_bytes(STAMP_BYTES, "little") + self._filler
 
     def take(self, message: bytes) -> None:
-        """Note the time of a message that came back."""
+        """Add the time of a message that came back."""
         now_ns = time.monotonic_ns()
         sent_ns = int.from_bytes(message[:STAMP_BYTES], "little")
         self._begin = min(self._begin, now_ns / 1e9)
@@ -44,7 +44,7 @@ class Source:
             self._times_ms.append((now_ns - sent_ns) / 1e6)
 
     def save(self) -> None:
-        """Write the times to the file, whole or not at all."""
+        """Write the times to the file, atomically."""
         path = self._role["result"]
         with open(path + ".part", "w", encoding="utf-8") as file:
             json.dump(self._times_ms, file)
@@ -52,12 +52,12 @@ class Source:
 
 
 def passed_on(message: bytes, size: int) -> bytes:
-    """Return a message cut or padded to the size of the next hop."""
+    """Return a message that is cut or padded to the next hop's size [bytes]."""
     return message[:size] + bytes(max(0, size - len(message)))
 
 
 def run_dora(role: dict[str, Any]) -> None:
-    """Relay as a node of a dora dataflow: outputs `out`, inputs `in`, and `tick` of the source."""
+    """Relay as a node of a dora dataflow, from `in` to `out`; the source also has `tick`."""
     from dora import Node
 
     node, size = Node(), role["sizes"][role["index"]]
@@ -95,20 +95,20 @@ def run_ros1(role: dict[str, Any]) -> None:
         else:
             out.publish(UInt8MultiArray(data=passed_on(message.data, size)))
 
-    before = (index - 1) % len(role["sizes"])
-    rospy.Subscriber(f"relay/{before}", UInt8MultiArray, take, tcp_nodelay=True)
+    previous = (index - 1) % len(role["sizes"])
+    rospy.Subscriber(f"relay/{previous}", UInt8MultiArray, take, tcp_nodelay=True)
     if source is None:
         rospy.spin()
         return
-    turn = threading.Event()
+    timer = threading.Event()
     begin, sent = time.monotonic(), 0
     while not source.over:
         out.publish(UInt8MultiArray(data=source.message()))
         sent += 1
-        turn.wait(max(0.0, begin + sent / role["rate_hz"] - time.monotonic()))
+        timer.wait(max(0.0, begin + sent / role["rate_hz"] - time.monotonic()))
     source.save()
 
 
 if __name__ == "__main__":
-    given = json.loads(sys.argv[1])
-    {"dora": run_dora, "rospy": run_ros1}[given["system"]](given)
+    own_role = json.loads(sys.argv[1])
+    {"dora": run_dora, "rospy": run_ros1}[own_role["system"]](own_role)

@@ -1,4 +1,4 @@
-"""Global planning, timed: costs of a map, the first plan on a changed one, paths, optimality."""
+"""`gigabrain bench plan`: times costmaps, plans and replans, and checks that paths are optimal."""
 
 import itertools
 import time
@@ -24,16 +24,16 @@ if TYPE_CHECKING:
 
 RULES = Inflation(fits=0.2, turns=0.3)
 ROUNDS = 7  # of each operation on the same map
-GOALS = 4  # from one start; they share its Dijkstra
-SHARE, SPREAD = 0.75, 0.1  # cost of a path as a share of the map's side, and its tolerance
+GOALS = 4  # per start; they share its Dijkstra field
+COST_SHARE, SPREAD = 0.75, 0.1  # cost of a path as a share of the map's side, and its tolerance
 
 
 RESOLUTION = 0.05  # [m]
 DENSITY = 0.2  # of the random map
-PITCH, ROOM, WALL, DOOR = 240, 96, 2, 20  # cells: four rooms and two corridors repeat
-FURNITURE = 3  # pieces a room
-OBJECT_CELLS = 10  # a side
-POINTS_PER_M = 10  # of a path
+PITCH, ROOM, WALL, DOOR = 240, 96, 2, 20  # [cells]; four rooms and two corridors per PITCH
+FURNITURE = 3  # pieces per room
+OBJECT_CELLS = 10  # per side
+POINTS_PER_M = 10  # on a path
 Cells = NDArray[np.int8]
 
 
@@ -50,10 +50,10 @@ class Timing(Struct, frozen=True, kw_only=True):
 class SizeFigures(Struct, frozen=True, kw_only=True):
     """Figures of one size of map."""
 
-    size: int  # cells a side
+    size: int  # cells per side
     path_m: float  # mean length of the paths
     timings: tuple[Timing, ...]
-    ratio: float  # worst cost of A* over Dijkstra's; 1 is optimal
+    ratio: float  # worst ratio of A*'s cost to Dijkstra's; 1 is optimal
 
 
 class PlanResult(Struct, frozen=True, kw_only=True):
@@ -79,7 +79,7 @@ class Query(NamedTuple):
 
 
 class OperationTimer:
-    """Measures one operation repeatedly. Used as `with`."""
+    """Measures each run of a `with` block."""
 
     def __init__(self) -> None:
         self.wall_ms: list[float] = []
@@ -116,10 +116,10 @@ def measure_plan(
     figures = []
     for size in sizes:
         show(f"{size} x {size} cells")
-        one, made, paths = _measure(size, queries, np.random.default_rng(seed))
+        one, map_costs, paths = _measure(size, queries, np.random.default_rng(seed))
         figures.append(one)
     if png is not None:
-        draw_side_by_side([(made, paths)], 1, _draw, png)
+        draw_side_by_side([(map_costs, paths)], 1, _draw, png)
     return PlanResult(seed=seed, sizes=tuple(figures))
 
 
@@ -128,25 +128,25 @@ def _measure(
 ) -> tuple[SizeFigures, Costmap, list[Path]]:
     cells = office(size, rng)
     grid, planner = grid_of(cells), GlobalPlanner()
-    made = costmap(grid, RULES)
+    map_costs = costmap(grid, RULES)
     whole, changed, first = OperationTimer(), OperationTimer(), OperationTimer()
-    asked = list(itertools.islice(_queries(made, planner.search, rng), queries))
+    query_list = list(itertools.islice(_queries(map_costs, planner.search, rng), queries))
     for i in range(ROUNDS):
         with whole:
             costmap(grid, RULES)
         now = grid_of(with_new_furniture(cells, rng))
         with changed:
-            costmap(now, RULES, None, made)
-        one = asked[i % len(asked)]
+            costmap(now, RULES, None, map_costs)
+        one = query_list[i % len(query_list)]
         with first:
-            planner.plan(costmap(now, RULES, None, made), one.start, one.goal)
+            planner.plan(costmap(now, RULES, None, map_costs), one.start, one.goal)
     searching, planning, ratios, paths = OperationTimer(), OperationTimer(), [], []
-    for one in asked:
+    for one in query_list:
         with searching:
-            cells_on = planner.search.path(made.cost, one.begin, one.end)
-        ratios.append(_paid(made.cost, cells_on) / one.cheapest)
+            cells_on = planner.search.path(map_costs.cost, one.begin, one.end)
+        ratios.append(_path_cost(map_costs.cost, cells_on) / one.cheapest)
         with planning:
-            found = planner.plan(made, one.start, one.goal)
+            found = planner.plan(map_costs, one.start, one.goal)
         paths += [found] if isinstance(found, Path) else []
     timings = (
         whole.timing("costs of the whole map"),
@@ -154,29 +154,29 @@ def _measure(
         first.timing("costs after a change, and a plan"),
         searching.timing("optimal path, office"),
         planning.timing("the same, pulled tight"),
-        *_replanned(made, cells, paths, rng.spawn(1)[0]),
+        *_replanned(map_costs, cells, paths, rng.spawn(1)[0]),
         *_corner_to_corner(size, rng, ratios),
     )
     length = float(np.mean([one.remaining[0] for one in paths]))
     worst = max(ratios, key=lambda ratio: abs(ratio - 1))
-    return SizeFigures(size=size, path_m=length, timings=timings, ratio=worst), made, paths
+    return SizeFigures(size=size, path_m=length, timings=timings, ratio=worst), map_costs, paths
 
 
 def _replanned(
-    made: Costmap, cells: Cells, paths: list[Path], rng: np.random.Generator
+    map_costs: Costmap, cells: Cells, paths: list[Path], rng: np.random.Generator
 ) -> tuple[Timing, Timing]:
-    """Time from a new map to the path, as decision plans: after a change somewhere, and on it.
+    """Time from a new map to the path, like decision: a change is elsewhere, or on the path.
 
-    The robot has come a metre along its path. An object appears, and disappears again.
+    The robot is a metre along its path. An object appears, and disappears again.
     """
     planner, elsewhere, ahead = GlobalPlanner(), OperationTimer(), OperationTimer()
-    costs = replace(made, cost=made.cost.copy())  # they are renewed in place
+    costs = replace(map_costs, cost=map_costs.cost.copy())  # it is updated in place
     for old in paths:
         here, goal = _point(old, POINTS_PER_M), _point(old, -1)
         planner.replan(costs, _point(old, 0), goal, old)
         for timer, changed in (
             (elsewhere, with_new_furniture(cells, rng)),
-            (ahead, _blocked(made, cells, old, rng)),
+            (ahead, _blocked(map_costs, cells, old, rng)),
         ):
             for cells_now, timed in ((changed, timer), (cells, elsewhere)):
                 grid = grid_of(cells_now)
@@ -191,25 +191,25 @@ def _point(path: Path, number: int) -> Point:
     return x, y
 
 
-def _blocked(made: Costmap, cells: Cells, path: Path, rng: np.random.Generator) -> Cells:
+def _blocked(map_costs: Costmap, cells: Cells, path: Path, rng: np.random.Generator) -> Cells:
     """Return the map with an object of 0.5 m in the middle half of a path."""
     count = len(path.points)
-    at = made.cell(*_point(path, int(rng.integers(count // 4, 3 * count // 4))))
+    at = map_costs.cell(*_point(path, int(rng.integers(count // 4, 3 * count // 4))))
     assert at
     return _with_object(cells, max(at[0] - OBJECT_CELLS // 2, 0), max(at[1] - OBJECT_CELLS // 2, 0))
 
 
-def _queries(made: Costmap, search: GridSearch, rng: np.random.Generator) -> Iterator[Query]:
-    """Yield starts and goals at the wanted distance, by Dijkstra."""
-    wanted = SHARE * len(made.cost)
-    open_ = np.argwhere(made.cost < 2)
+def _queries(map_costs: Costmap, search: GridSearch, rng: np.random.Generator) -> Iterator[Query]:
+    """Yield starts and goals with a path of about the wanted cost, by Dijkstra."""
+    wanted = COST_SHARE * len(map_costs.cost)
+    open_ = np.argwhere(map_costs.cost < 2)
     while True:
         begin = _cell(open_[rng.integers(len(open_))])
-        field = search.field(made.cost, begin, "from")
-        far = np.argwhere((np.abs(field / wanted - 1) < SPREAD) & (made.cost < 2))
+        field = search.field(map_costs.cost, begin, "from")
+        far = np.argwhere((np.abs(field / wanted - 1) < SPREAD) & (map_costs.cost < 2))
         for _ in range(GOALS if len(far) else 0):
             end = _cell(far[rng.integers(len(far))])
-            start, goal = _middle(made, begin), _middle(made, end)
+            start, goal = _middle(map_costs, begin), _middle(map_costs, end)
             yield Query(begin, end, start, goal, float(field[end]))
 
 
@@ -217,15 +217,15 @@ def _cell(at: NDArray[np.intp]) -> tuple[int, int]:
     return int(at[0]), int(at[1])
 
 
-def _middle(made: Costmap, cell: tuple[int, int]) -> Point:
-    x, y = made.points(np.array(cell[:1]), np.array(cell[1:]))[0].tolist()
+def _middle(map_costs: Costmap, cell: tuple[int, int]) -> Point:
+    x, y = map_costs.points(np.array(cell[:1]), np.array(cell[1:]))[0].tolist()
     return x, y
 
 
 def _corner_to_corner(
     size: int, rng: np.random.Generator, ratios: list[float]
 ) -> tuple[Timing, Timing]:
-    """Time A* and Dijkstra over a random map; append the ratio of their costs to `ratios`."""
+    """Time A* and Dijkstra on a random map; append the ratio of their costs to `ratios`."""
     cost, search, one, all_ = scattered(size, rng), GridSearch(), OperationTimer(), OperationTimer()
     goal = (size - 1, size - 1)
     for _ in range(ROUNDS):
@@ -233,14 +233,14 @@ def _corner_to_corner(
             cells = search.path(cost, (0, 0), goal)
         with all_:
             field = search.field(cost, (0, 0), "from")
-    ratios.append(_paid(cost, cells) / float(field[goal]))
+    ratios.append(_path_cost(cost, cells) / float(field[goal]))
     return one.timing("optimal path, random map, corner to corner"), all_.timing(
         "Dijkstra of it all"
     )
 
 
-def _paid(cost: Costs, cells: Ints | None) -> float:
-    """Return the cost of a path over cells; inf for none."""
+def _path_cost(cost: Costs, cells: Ints | None) -> float:
+    """Return the cost of a path along cells (n, 2); inf without a path."""
     if cells is None:
         return float("inf")
     on = cost[cells[:, 0], cells[:, 1]].astype(np.float64)
@@ -249,10 +249,10 @@ def _paid(cost: Costs, cells: Ints | None) -> float:
 
 def _draw(axes: "Axes", drawn: tuple[Costmap, list[Path]]) -> None:
     """Draw costs, dark where high, and paths in colours."""
-    made, paths = drawn
-    grey = 255 - 12 * made.cost.clip(1, 14)
-    grey[made.cells > 0] = 0
-    height, width = (side * made.resolution for side in grey.shape)
+    map_costs, paths = drawn
+    grey = 255 - 12 * map_costs.cost.clip(1, 14)
+    grey[map_costs.cells > 0] = 0
+    height, width = (side * map_costs.resolution for side in grey.shape)
     axes.imshow(grey, "gray", origin="lower", extent=(0.0, width, 0.0, height))
     for number, path in enumerate(paths, 1):
         axes.plot(*path.points.T, label=f"path {number}")

@@ -1,7 +1,7 @@
 """`gigabrain bench reach`: an arm goes to random goals near its body, past a shelf.
 
-Planner, control, safety and gate are those of a robot, stepped in memory on a simulated body. The
-physics tells what the arm touches on its way, and where its tool comes to rest.
+Planner, control, safety and gate are the same as on a robot; they run in memory on a simulated
+body. The physics give the contacts on the way, and the tool's true position at rest.
 """
 
 import math
@@ -37,11 +37,11 @@ from gigabrain_zenoh.qa.bench.hands import ArmInMemory
 from gigabrain_zenoh.safety.arm_shape import MujocoArm
 from gigabrain_zenoh.safety.step import SafetyInputs, SafetyMemory, step
 
-LOW, HIGH = (-0.3, -1.0, -0.1), (1.0, 1.0, 0.9)  # where goals are, in lengths of the stretched arm
-SHELF_AT, SHELF_SIZE = (0.7, 0.0, 0.36), (0.45, 0.9, 0.04)  # likewise
-PITCHES_RAD = -math.pi / 6, math.pi / 2  # of every other goal: how far the tool points down
+LOW, HIGH = (-0.3, -1.0, -0.1), (1.0, 1.0, 0.9)  # range of goals, in lengths of the stretched arm
+SHELF_AT, SHELF_SIZE = (0.7, 0.0, 0.36), (0.45, 0.9, 0.04)  # in the same unit
+PITCHES_RAD = -math.pi / 6, math.pi / 2  # range of the tool's pitch, for every other goal
 SHOW_EVERY = 100
-REST_TICKS = 100  # after a goal is reached, in which control corrects what its weight pulls it down
+REST_TICKS = 100  # at a goal, until control has corrected the sag by the arm's weight
 REASON = "going to a goal"
 Progress = Callable[[str], None]
 
@@ -56,35 +56,35 @@ class Times(Struct, frozen=True, kw_only=True):
 
 
 class ReachResult(Struct, frozen=True, kw_only=True):
-    """All goals."""
+    """The results of all goals."""
 
     body: str
     seed: int
     goals: int
-    reached: int  # the arm went there
-    refused: dict[str, int]  # goals by why no posture was found
-    no_way: dict[str, int]  # goals with a posture, by why there is no path to it
-    held: int  # goals to which safety did not let it come
-    touched: tuple[str, ...]  # a line for each goal on whose way the arm touched something
+    reached: int
+    refused: dict[str, int]  # number of goals without a posture, by cause
+    no_way: dict[str, int]  # number of goals with a posture but without a path, by reason
+    held: int  # number of goals that safety kept the arm from
+    touched: tuple[str, ...]  # a line for each goal with a contact on the way
     off_p95_m: float  # of the tool from its goal, 2 s after it was reached
-    solved: Times  # inverse kinematics of goals with a posture,
-    unsolved: Times  # and of the others, until it is known why
+    solved: Times  # inverse kinematics of goals with a posture
+    unsolved: Times  # the same, of goals without one
     planned: Times  # posture, path and trajectory
 
 
 class JudgedArm(ArmInMemory):
-    """An arm in memory with safety, and what it touches by the physics: anything, or itself."""
+    """An arm in memory with safety; it records the true contacts, also with itself."""
 
     def __init__(self, robot: RobotFile, body: SimModel, world: Path) -> None:
         self.touched = set[str]()
         self._shape = MujocoArm(body.model, robot.description())
-        self._watched = SafetyMemory()
+        self._safety_memory = SafetyMemory()
         super().__init__(robot, body, world)
 
     def step(self, intent: Intent) -> None:
-        """Have 20 ms pass, and note what touches."""
-        seen = SafetyInputs(state=self.state(), arm=self._shape)
-        self._watched, verdict = step(self.description, self._watched, seen)
+        """Step 20 ms, and record contacts."""
+        inputs = SafetyInputs(state=self.state(), arm=self._shape)
+        self._safety_memory, verdict = step(self.description, self._safety_memory, inputs)
         self.caps = verdict.joints
         super().step(intent)
         model, contact = self.simulation.model, self.simulation.data.contact
@@ -93,7 +93,7 @@ class JudgedArm(ArmInMemory):
             self.touched.add(" and ".join(model.geom(geom).name or "something" for geom in pair))
 
     def follow(self, phases: Sequence[Phase]) -> bool:
-        """Carry out the phases of a plan; return whether the arm has come to its end in time."""
+        """Execute the phases of a plan; return whether the arm reaches its end in time."""
         run = PhaseRun(phases, self.description.joints[-1].name, self.state().tick)
         while run.phase:
             state = self.state()
@@ -117,7 +117,7 @@ class JudgedArm(ArmInMemory):
 
 
 def measure_reach(body: str, goals: int, seed: int, show: Progress) -> ReachResult:
-    """Have an arm go to goals. Raises ConfigError for a body without an arm, or one that drives."""
+    """Send an arm to goals. Raises ConfigError for a body without an arm, or one that drives."""
     robot, _, options, folder = load_link(body, Run(folder=Path()))
     if robot.arm is None or robot.description().has_base or not isinstance(options, MujocoOptions):
         raise ConfigError(f"{body} has no arm that stands in MuJoCo; choose so101 or piper")
@@ -132,7 +132,7 @@ def measure_reach(body: str, goals: int, seed: int, show: Progress) -> ReachResu
 
 
 class Course:
-    """One arm, and what has come of its goals so far."""
+    """One arm, and the results of its goals so far."""
 
     def __init__(self, robot: RobotFile, model: SimModel) -> None:
         assert robot.arm
@@ -154,7 +154,7 @@ class Course:
         self.off: list[float] = []  # [m]
 
     def go(self, rng: np.random.Generator, *, with_pitch: bool) -> None:
-        """Draw a goal, and go there if that is possible."""
+        """Draw a goal, and go there if possible."""
         point = self._reach * rng.uniform(LOW, HIGH)
         pitch = float(rng.uniform(*PITCHES_RAD)) if with_pitch else None
         if not self._has_posture(point, pitch, self._arm.posture(self._kinematics.names)):
@@ -168,39 +168,41 @@ class Course:
             self._touched.append(f"to ({where}): {'; '.join(sorted(self._arm.touched))}")
         if arrived:
             places = dict(zip(self._arm.arm.names, self._arm.arm.truth()[0], strict=True))
-            there = np.array([places[name] for name in self._kinematics.names])
-            self.off.append(float(np.linalg.norm(self._kinematics.forward(there).position - point)))
+            posture = np.array([places[name] for name in self._kinematics.names])
+            self.off.append(
+                float(np.linalg.norm(self._kinematics.forward(posture).position - point))
+            )
 
     def _follow(self, point: Floats, pitch: float | None) -> bool:
-        """Return whether the arm has come to a goal; where it is held up it plans again."""
+        """Return whether the arm reaches a goal; if safety holds it up, plan again."""
         for _ in range(1 + HOLD_UPS):
-            began = time.perf_counter()
+            begin_s = time.perf_counter()
             posture = self._arm.posture(self._kinematics.names)
             plan = self._planner.reach(point, pitch, [], posture, None)
             if isinstance(plan, NoWay):
                 self._no_way[plan.reason] += 1
                 return False
-            self._planned.append((time.perf_counter() - began) * 1000)
+            self._planned.append((time.perf_counter() - begin_s) * 1000)
             if self._arm.follow(plan.phases):
                 return True
         self._held += 1
         return False
 
     def _has_posture(self, point: Floats, pitch: float | None, posture: Floats) -> bool:
-        """Return whether there is a posture for a goal; time how long it takes to tell."""
+        """Return whether there is a posture for a goal; record the time of the search."""
         goal = self._planner.tool_goal(point, pitch)
-        began = time.perf_counter()
+        begin_s = time.perf_counter()
         found = self._inverse.solve(goal, posture, self._checker.touches)
-        took = (time.perf_counter() - began) * 1000
+        took_ms = (time.perf_counter() - begin_s) * 1000
         if isinstance(found, OutOfReach):
             self._refused[found.cause] += 1
-            self._unsolved.append(took)
+            self._unsolved.append(took_ms)
             return False
-        self._solved.append(took)
+        self._solved.append(took_ms)
         return True
 
     def result(self, body: str, seed: int) -> ReachResult:
-        """Return the figures."""
+        """Return the results so far."""
         return ReachResult(
             body=body, seed=seed, goals=len(self._solved) + len(self._unsolved),
             reached=len(self.off), refused=dict(self._refused), no_way=dict(self._no_way),
@@ -212,7 +214,7 @@ class Course:
 
 
 def _before(shelf: KeepOut, robot: RobotFile, model: SimModel) -> JudgedArm:
-    """Return an arm on a floor, before a shelf."""
+    """Return an arm on a floor, with a shelf in front of it."""
     place = " ".join(f"{one:g}" for one in shelf.center)
     half = " ".join(f"{one / 2:g}" for one in shelf.size)
     with tempfile.TemporaryDirectory(prefix="gigabrain-") as folder:

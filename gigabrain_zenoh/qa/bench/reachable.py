@@ -1,7 +1,7 @@
-"""Poses that a body's own motions reach in a world: a search of its own, apart from the planner.
+"""Finds the poses that a body's motions can reach in a world, independently of the planner.
 
-It knows the true shapes of the world, not the map. A flood from the start takes short motions of
-the body's kind, forward and back, and keeps one pose for each bin of place and heading.
+It uses the true shapes of the world, not the map. A flood fill from the start makes short motions
+of the body's kind, forward and back. It keeps one pose for each bin of position and heading.
 """
 
 import math
@@ -13,11 +13,11 @@ from gigabrain_drivers.sim.world import Pose, World, clearance
 from gigabrain_schemas.arrays import Floats
 from gigabrain_schemas.body import BodyDescription
 
-CELL_M = 0.05  # of the table of distances
-BIN_M, HEADINGS = 0.1, 36  # of the poses that are kept
-STEP_M, TURN_RAD = 0.15, math.radians(12.0)  # of a motion: it leaves its bin
-OUTLINE_M = 0.05  # [m], between points of the outline
-SPARE_M = 0.05  # [m], on top of what safety keeps free of a stopped body: maps have errors
+CELL_M = 0.05  # of the grid of distances
+BIN_M, HEADINGS = 0.1, 36  # bins of positions and headings
+STEP_M, TURN_RAD = 0.15, math.radians(12.0)  # of a motion; longer than a bin
+OUTLINE_M = 0.05  # between points of the outline
+SPARE_M = 0.05  # added to safety's margins, as maps have errors
 
 
 def reachable_poses(body: BodyDescription, world: World) -> Floats:
@@ -41,7 +41,7 @@ def reachable_poses(body: BodyDescription, world: World) -> Floats:
 
 
 def _motions(body: BodyDescription) -> list[tuple[float, float, float]]:
-    """Return what the body can do, as (ahead [m], aside [m], turn [rad]) on one arc."""
+    """Return the body's motions, each one arc: (ahead [m], aside [m], turn [rad])."""
     if body.drive_type == "ackermann":
         bend = STEP_M / body.turning_radius
         turns = (-bend, 0.0, bend)
@@ -56,21 +56,21 @@ def _free(
     distances: Floats, outline: Floats, margin: float, world: World, poses: Floats,
     motion: tuple[float, float, float],
 ) -> Floats:  # fmt: skip
-    """Return where `motion` leads from `poses` (n, 3), without those where it touches something."""
+    """Return the ends of `motion` from `poses` (n, 3), without motions that touch something."""
     free = np.ones(len(poses), np.bool_)
-    now = poses
+    moved = poses
     for share in (1 / 3, 2 / 3, 1.0):
         ahead, aside, turn = (share * part for part in motion)
         middle = poses[:, 2] + turn / 2
         cosine, sine = np.cos(middle), np.sin(middle)
         x, y = poses[:, 0] + ahead * cosine - aside * sine, poses[:, 1] + ahead * sine
-        now = np.column_stack((x, y + aside * cosine, poses[:, 2] + turn))
-        free &= _rooms(distances, outline, world, now) > margin
-    return now[free]
+        moved = np.column_stack((x, y + aside * cosine, poses[:, 2] + turn))
+        free &= _rooms(distances, outline, world, moved) > margin
+    return moved[free]
 
 
 def _rooms(distances: Floats, outline: Floats, world: World, poses: Floats) -> Floats:
-    """Return the least distance [m] of the outline to anything, at each of `poses` (n, 3)."""
+    """Return the outline's clearance [m] at each of `poses` (n, 3)."""
     cosine, sine = np.cos(poses[:, 2:]), np.sin(poses[:, 2:])
     x = poses[:, :1] + cosine * outline[:, 0] - sine * outline[:, 1]
     y = poses[:, 1:2] + sine * outline[:, 0] + cosine * outline[:, 1]

@@ -3,8 +3,8 @@
     source ──scan──► first ──world──► second ──intent──► third ──cmd──► source
 
 A callback publishes at once: no asyncio, no decoding, no work. Each process has the Zenoh threads
-and the niceness of the one that it stands for. Started as `python -m gigabrain_zenoh.qa.bench.relay
-ROLE`, with a RelayRole in JSON.
+and the niceness of the one that it replaces. The command is `python -m
+gigabrain_zenoh.qa.bench.relay ROLE`, with a RelayRole in JSON.
 """
 
 import json
@@ -36,16 +36,16 @@ class RelayRole(Struct, frozen=True, kw_only=True):
 
     gets: str  # key
     puts: str  # key
-    size: int  # bytes of what it puts
-    endpoint: Endpoint  # its router; or, of a peer, where it listens and connects
-    first: bool = False  # it gets a higher priority where allowed, as driver and control do
+    size: int  # [bytes], of its messages
+    endpoint: Endpoint  # its router; for a peer, where it listens and connects
+    first: bool = False  # has a higher priority where allowed, like driver and control
     rate_hz: float = 0.0  # of the source; 0 for the others
-    settle_s: float = 0.0  # of the source: for how long it does not measure
-    seconds: float = 0.0  # of the source: for how long it does
+    settle_s: float = 0.0  # of the source: time before the measurement
+    seconds: float = 0.0  # of the source: time of the measurement
 
 
 def open_session(endpoint: Endpoint) -> zenoh.Session:
-    """Open a session configured like ours; one that listens is a peer here, not a router."""
+    """Open a session configured like ours. A listening one is a peer here, not a router."""
     settings = session_config(endpoint)
     if endpoint.listen:
         settings["mode"] = "peer"
@@ -56,7 +56,7 @@ def open_session(endpoint: Endpoint) -> zenoh.Session:
 
 
 def publisher(session: zenoh.Session, key: str) -> zenoh.Publisher:
-    """Declare a publisher as the bus does for a stream."""
+    """Declare a publisher like the bus's for a stream."""
     return session.declare_publisher(
         key, priority=zenoh.Priority.DATA, congestion_control=zenoh.CongestionControl.DROP
     )
@@ -82,7 +82,7 @@ def measure(session: zenoh.Session, role: RelayRole) -> None:
     times_ms: list[float] = []
     settled = threading.Event()
 
-    def back(sample: zenoh.Sample) -> None:
+    def on_return(sample: zenoh.Sample) -> None:
         sent_ns = int.from_bytes(sample.payload.to_bytes()[:STAMP_BYTES], "little")
         if settled.is_set():
             times_ms.append((time.monotonic_ns() - sent_ns) / 1e6)
@@ -90,7 +90,7 @@ def measure(session: zenoh.Session, role: RelayRole) -> None:
     def send() -> None:
         put(time.monotonic_ns().to_bytes(STAMP_BYTES, "little") + filler)
 
-    subscriber = session.declare_subscriber(role.gets, back)
+    subscriber = session.declare_subscriber(role.gets, on_return)
     print_record({"event": "ready"})
     paced(role.rate_hz, role.settle_s, send)
     settled.set()
@@ -120,7 +120,7 @@ def main() -> None:
     signal.pthread_sigmask(signal.SIG_BLOCK, ENDS)  # before Zenoh's threads inherit the mask
     role = msgspec.json.decode(sys.argv[1], type=RelayRole)
     os.environ.setdefault("ZENOH_RUNTIME", ZENOH_RUNTIME)
-    if role.first:  # before there are threads, which inherit it
+    if role.first:  # before threads start, which inherit it
         go_first()
     session = open_session(role.endpoint)
     if role.rate_hz:

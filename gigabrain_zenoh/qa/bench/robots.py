@@ -1,4 +1,4 @@
-"""`gigabrain bench robots`: robots that explore side by side at real time, and what each costs."""
+"""`gigabrain bench robots`: robots explore side by side at real time; measures the cost of each."""
 
 import asyncio
 import contextlib
@@ -31,31 +31,31 @@ from gigabrain_zenoh.qa.robot_under_test import (
 if TYPE_CHECKING:
     from rich.console import Group
 
-SETTLE_S = 5.0  # the first plan and the first map are no part of what a running robot costs
-ANSWER_S = 20.0  # for a report, on a machine that is too small
-MAX_P99_MS = 60.0  # of scan to command
-MAX_STOOD = 0.05  # share of the time that a robot may stand because the gate is shut
+SETTLE_S = 5.0  # the first plan and the first map do not count
+ANSWER_TIMEOUT_S = 20.0  # for a report, on a machine that is too small
+MAX_P99_MS = 60.0  # from scan to command
+MAX_STOOD = 0.05  # share of the time with a shut gate
 MB = 1e6
 
 
 class FleetRobot(Struct, frozen=True, kw_only=True):
-    """One of the robots. Contacts and distance are those of the physics."""
+    """Figures of one robot. Contacts and distance are true values of the physics."""
 
     number: int
-    problem: str = ""  # why it has no figures
+    problem: str = ""  # reason for missing figures
     contacts: int = 0
     distance_m: float = 0.0
-    real_time: float = 0.0  # the robot's time in parts of the wall's
-    stood: float = 0.0  # share of that time in which the gate was shut
+    real_time: float = 0.0  # the robot's time over wall time
+    stood: float = 0.0  # share of the robot's time with a shut gate
     p50_ms: float | None = None  # scan to command, since the start; None before the first
     p99_ms: float | None = None
-    cpu: float = 0.0  # of one core, all processes, without physics
-    physics_cpu: float = 0.0  # of one core, with the lidar's rays
-    pss_bytes: int = 0  # of all processes: what several share counts in parts
+    cpu: float = 0.0  # share of one core, all processes, without physics
+    physics_cpu: float = 0.0  # share of one core, with the lidar's rays
+    pss_bytes: int = 0  # of all processes; shared memory is divided among its users
 
     @property
     def too_slow(self) -> str:
-        """Return in what the machine is too small for it; empty if it is not."""
+        """Why the machine is too small for this robot; empty if it is not."""
         if self.problem:
             return ""
         if self.real_time < KEPT:
@@ -70,57 +70,57 @@ class FleetRobot(Struct, frozen=True, kw_only=True):
 
 
 class RobotsResult(Struct, frozen=True, kw_only=True):
-    """All robots."""
+    """The figures of all robots."""
 
     body: str
     world: str
     seconds: float
     cores: int
-    busy: float  # of the whole machine, while they drove
+    busy: float  # share of all cores that was busy while they drove
     robots: tuple[FleetRobot, ...]
 
     @property
     def verdict(self) -> str:
-        """Return whether the machine carries them, in a line."""
+        """Whether the machine is large enough for them, as one line."""
         count = len(self.robots)
         slow = [f"robot {one.number}: {one.too_slow}" for one in self.robots if one.too_slow]
         failed = [f"robot {one.number}: {one.problem}" for one in self.robots if one.problem]
-        why = "; ".join((*slow, *failed))
+        reasons = "; ".join((*slow, *failed))
         if slow:
-            return f"this machine is too small for {count} of these robots: {why}"
+            return f"this machine is too small for {count} of these robots: {reasons}"
         if failed:
-            return f"{len(failed)} of these {count} robots failed: {why}"
+            return f"{len(failed)} of these {count} robots failed: {reasons}"
         if contacts := sum(one.contacts for one in self.robots):
             return f"this machine carries {count} of these robots, but they had {contacts} contacts"
         return f"this machine carries {count} of these robots"
 
     @property
     def ok(self) -> bool:
-        """True if the machine carries them, and none touched anything."""
+        """True if the machine is large enough for them, and there were no contacts."""
         return not any(one.too_slow or one.problem or one.contacts for one in self.robots)
 
 
 class _Start:
-    """Lets all robots begin together, once each is ready or has failed."""
+    """Lets all robots begin together, when each is ready or has failed."""
 
     def __init__(self, count: int) -> None:
         self._missing, self.all = count, asyncio.Event()
 
     def settled(self) -> None:
-        """Count one that is ready or has failed."""
+        """Count a robot that is ready or has failed."""
         self._missing -= 1
         if not self._missing:
             self.all.set()
 
     async def wait(self, group: ProcessGroup) -> None:
-        """Wait for the others. Raises Failed when a process of `group` dies."""
+        """Wait for the other robots. Raises Failed when a process of `group` dies."""
         await group.until(self.all.is_set, "the other robots are ready", 2 * START_S)
 
 
 async def measure_robots(
     body: str, world: str, count: int, seconds: float, show: Callable[[str], None]
 ) -> RobotsResult:
-    """Have robots explore worlds of their own, and measure them all at once.
+    """Let robots explore, each in its own world, and measure all at once.
 
     Raises ConfigError for a body without a base or a lidar.
     """
@@ -182,9 +182,9 @@ async def _robot(number: int, deployment: Deployment, seconds: float, start: _St
 async def _measured(number: int, group: ProcessGroup, bus: Bus, seconds: float) -> FleetRobot:
     await group.run_for(SETTLE_S)
     loop = asyncio.get_running_loop()
-    before, cpu_s, began_s = await _report(group, bus), group.cpu_s, loop.time()
+    before, cpu_s, begin_s = await _report(group, bus), group.cpu_s, loop.time()
     await group.run_for(seconds)
-    after, passed_s = await _report(group, bus), loop.time() - began_s
+    after, passed_s = await _report(group, bus), loop.time() - begin_s
     physics = physics_share(before, after, passed_s) or 0.0
     gained = {
         key: float(after[key]) - float(before[key])
@@ -206,7 +206,7 @@ async def _measured(number: int, group: ProcessGroup, bus: Bus, seconds: float) 
 
 
 async def _report(group: ProcessGroup, bus: Bus) -> Mapping[str, Any]:
-    """Return the driver's report. Raises Failed where it does not come."""
+    """Return the driver's report. Raises Failed if it does not arrive."""
     found: dict[str, Any] = {}
 
     async def ask() -> None:
@@ -215,14 +215,14 @@ async def _report(group: ProcessGroup, bus: Bus) -> Mapping[str, Any]:
 
     asking = asyncio.ensure_future(ask())
     try:
-        await group.until(lambda: bool(found), "a report of the driver", ANSWER_S)
+        await group.until(lambda: bool(found), "a report of the driver", ANSWER_TIMEOUT_S)
     finally:
         asking.cancel()
     return found
 
 
 def shut_share(records: Sequence[Mapping[str, Any]], begin_s: float, end_s: float) -> float:
-    """Return for which share of the robot's time its gate was shut, by the driver's log."""
+    """Return the share of the robot's time with a shut gate, by the driver's log."""
     shut_s, since_s, is_shut = 0.0, begin_s, True
     for record in records:
         if record.get("event") != "gate":
@@ -234,7 +234,7 @@ def shut_share(records: Sequence[Mapping[str, Any]], begin_s: float, end_s: floa
 
 
 def _pss_bytes(pid: int) -> int:
-    """Return the memory of a process, or what it holds alone where the system tells no more."""
+    """Return a process's PSS [bytes], or its USS where the system has no PSS; 0 if it is gone."""
     with contextlib.suppress(psutil.Error):
         memory = psutil.Process(pid).memory_full_info()
         return int(getattr(memory, "pss", memory.uss))
@@ -242,7 +242,7 @@ def _pss_bytes(pid: int) -> int:
 
 
 def robots_page(result: RobotsResult) -> "Group":
-    """Return what `gigabrain bench robots` prints."""
+    """Return the page that `gigabrain bench robots` prints."""
     from rich.console import Group
     from rich.text import Text
 

@@ -1,9 +1,9 @@
 """`gigabrain bench slam --log`: maps recorded laser logs, and compares them with reference poses.
 
-R. Kümmerle et al., On measuring the accuracy of SLAM algorithms, Autonomous Robots 2009: a map is
-judged by the relations of nearby poses, not by the poses themselves. The reference of some logs is
-wrong in places, so crispness judges a map by its own scans: a wall that is drawn twice fills twice
-as many cells.
+R. Kümmerle et al., On measuring the accuracy of SLAM algorithms, Autonomous Robots 2009: the
+relative poses of nearby scans are compared, not the poses themselves. The reference of some logs is
+partly wrong, so crispness judges a map by its own scans: a wall that is drawn twice fills twice as
+many cells.
 """
 
 import sys
@@ -27,10 +27,10 @@ from gigabrain_zenoh.mapping.slam import Estimate, Slam
 from gigabrain_zenoh.qa.judging import Latencies, latencies
 
 T = TypeVar("T")
-RANGE_MIN, RANGE_MAX = 0.1, 25.0  # [m], beyond them a beam says nothing
-NEAR_M = 3.0  # [m], poses of a relation
-DENSE_M = 0.3  # [m], a median step below it makes a dense log
-GAP, DENSE_GAP = 30, 300  # scans between the poses of a relation
+RANGE_MIN, RANGE_MAX = 0.1, 25.0  # [m], of valid beams
+NEAR_M = 3.0  # largest distance of the two poses of a relation
+DENSE_M = 0.3  # a log with a smaller median step is dense
+GAP, DENSE_GAP = 30, 300  # least number of scans between the poses of a relation
 MAX_RELATIONS = 2000
 SEED = 0
 FIELDS = ("ranges", "ref", "odom")
@@ -100,7 +100,7 @@ def _near(places: Floats, first: int, start: int) -> NDArray[np.intp]:
 
 
 def errors(log: LaserLog, poses: Floats, pairs: NDArray[np.intp]) -> RelationErrors:
-    """Return the errors of `poses` (n, 3) over `pairs`."""
+    """Return the errors of `poses` (n, 3) over `pairs` (k, 2) of scans."""
     first, second = pairs.T
     wanted = between(log.reference[first], log.reference[second])
     off = between(wanted, between(poses[first], poses[second]))
@@ -114,7 +114,7 @@ def errors(log: LaserLog, poses: Floats, pairs: NDArray[np.intp]) -> RelationErr
 
 
 def laid_onto(poses: Floats, reference: Floats) -> Floats:
-    """Return `poses` (n, 3) moved as one, so that their places fit `reference` best (Umeyama)."""
+    """Return `poses` (n, 3) after the rigid motion that fits them best to `reference` (Umeyama)."""
     one, other = poses[:, :2], reference[:, :2]
     spread = (one - one.mean(axis=0)).T @ (other - other.mean(axis=0))
     turn = float(np.arctan2(spread[0, 1] - spread[1, 0], spread[0, 0] + spread[1, 1]))
@@ -122,17 +122,17 @@ def laid_onto(poses: Floats, reference: Floats) -> Floats:
     return compose(np.array((*other.mean(axis=0), turn)), compose(inverse(about), poses))
 
 
-CELL_M = 0.1  # [m]
-NEAREST, FARTHEST = 0.3, 15.0  # [m], of the hits that count
-GRID_TURNS = 8  # spread over a right angle: one turn alone may be off by 3 %
-KEY = 1 << 20  # cells along a row, 100 km
+CELL_M = 0.1
+NEAREST, FARTHEST = 0.3, 15.0  # [m], ranges of hits that count
+GRID_TURNS = 8  # spread over a right angle, as the result of a single one errs by 3 %
+KEY = 1 << 20  # cells per row (100 km), to number cells
 
 
 def crispness(log: LaserLog, poses: Floats) -> float:
-    """Return the cells filled at `poses` (n, 3) per cell filled at the log's reference poses.
+    """Return the ratio of filled cells at `poses` (n, 3) to those at the log's reference poses.
 
-    `poses` are laid onto the reference by one rigid fit first. Below 1 is crisper than the
-    reference. The ratio is the mean over turns of the grid.
+    First, a rigid motion fits `poses` to the reference. Below 1 is crisper than the reference. The
+    ratio is the mean over turns of the grid.
     """
     bodies = [hits(log, at) for at in range(len(log.ranges))]
     turns: Floats = np.linspace(0, np.pi / 2, GRID_TURNS, endpoint=False)
@@ -142,28 +142,28 @@ def crispness(log: LaserLog, poses: Floats) -> float:
 
 
 def hits(log: LaserLog, at: int) -> Floats:
-    """Return the hits of one scan (n, 2) in the body's frame [m], of the ranges that count."""
+    """Return the hits of one scan (n, 2) [m] in the body's frame, within the ranges that count."""
     points = log.scan(at).points.astype(np.float64)
     away = np.hypot(*points.T)
     return np.asarray(points[(away > NEAREST) & (away < FARTHEST)])
 
 
 def cells_filled(bodies: list[Floats], poses: Floats, turns: Floats) -> Floats:
-    """Return how many cells the scans fill at `poses` (n, 3), for each turn [rad] of the grid."""
+    """Return the number of cells that the scans fill at `poses` (n, 3), for each turn [rad]."""
     return np.array([_filled(bodies, compose(np.array((0, 0, turn)), poses)) for turn in turns])
 
 
 def _filled(bodies: list[Floats], poses: Floats) -> float:
-    each = np.array([len(body) for body in bodies])
+    counts = np.array([len(body) for body in bodies])
     points = np.concatenate(bodies)
-    x, y, yaw = np.repeat(poses, each, axis=0).T
+    x, y, yaw = np.repeat(poses, counts, axis=0).T
     cos, sin = np.cos(yaw), np.sin(yaw)
     columns = np.floor((x + cos * points[:, 0] - sin * points[:, 1]) / CELL_M).astype(np.int64)
     rows = np.floor((y + sin * points[:, 0] + cos * points[:, 1]) / CELL_M).astype(np.int64)
     return float(len(np.unique(rows * KEY + columns)))
 
 
-COLD = 20  # scans before anything is timed
+COLD_SCANS = 20  # without timing, at the start
 
 Progress = Callable[[], None]  # called after each scan
 
@@ -180,9 +180,9 @@ class LogResult(Struct, frozen=True, kw_only=True):
     odometry: RelationErrors
     front_end: RelationErrors
     graph: RelationErrors
-    crispness: float  # cells filled, per cell that the reference fills
-    unmatched: int  # scans placed by odometry or by a search
-    breaks: int  # in the sequence
+    crispness: float  # filled cells, as a ratio to the reference's
+    unmatched: int  # scans that were placed by odometry or by a search
+    breaks: int  # scans without a connection to the one before
     scan: Latencies
     loop: Latencies
     loop_max_ms: float
@@ -192,13 +192,13 @@ class SlamResult(Struct, frozen=True, kw_only=True):
     """Figures of all logs."""
 
     logs: tuple[LogResult, ...]
-    mean_m: float  # of the graphs' errors, over the logs
-    peak_mb: float  # of this process, imports included
+    mean_m: float  # mean of the graphs' errors over the logs
+    peak_mb: float  # memory of this process, with its imports
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MappedLog:
-    """A mapped log."""
+    """A log's map and poses, and the CPU times to make them."""
 
     slam: Slam
     estimates: list[Estimate]
@@ -214,7 +214,7 @@ class MappedLog:
 
 
 def map_log(log: LaserLog, progress: Progress) -> MappedLog:
-    """Map the log; loops are searched after each scan."""
+    """Map the log, and search loops after each scan."""
     steps = between(log.odometry[:-1], log.odometry[1:])
     steps = np.concatenate((np.zeros((1, 3)), steps))
     slam, loops = Slam(), 0
@@ -223,14 +223,14 @@ def map_log(log: LaserLog, progress: Progress) -> MappedLog:
     scan_ms: list[float] = []
     loop_ms: list[float] = []
     for at, step in enumerate(steps):
-        began = time.thread_time()
+        begin_s = time.thread_time()
         estimates.append(slam.add(log.scan(at), step))
-        scan_ms.append((time.thread_time() - began) * 1e3)
+        scan_ms.append((time.thread_time() - begin_s) * 1e3)
         smooth.append(slam.smooth)
         while slam.behind:
-            began = time.thread_time()
+            begin_s = time.thread_time()
             correction = slam.close_loops()
-            loop_ms.append((time.thread_time() - began) * 1e3)
+            loop_ms.append((time.thread_time() - begin_s) * 1e3)
             if correction:
                 slam.apply(correction)
                 loops += len(correction.loops)
@@ -246,7 +246,7 @@ def map_log(log: LaserLog, progress: Progress) -> MappedLog:
 
 
 def judge_log(log: LaserLog, driven: MappedLog) -> LogResult:
-    """Judge the map of a log. Raises ConfigError for a log that passes no place twice."""
+    """Judge the map of a log. Raises ConfigError if the log passes no place twice."""
     pairs, poses = relations(log), driven.poses()
     kinds = [estimate.kind for estimate in driven.estimates]
     return LogResult(
@@ -262,9 +262,9 @@ def judge_log(log: LaserLog, driven: MappedLog) -> LogResult:
         crispness=crispness(log, poses),
         unmatched=sum(kind in ("odometry", "searched") for kind in kinds),
         breaks=kinds.count("broken"),
-        scan=latencies(driven.scan_ms[COLD:]),
-        loop=latencies(driven.loop_ms[COLD:]),
-        loop_max_ms=max(driven.loop_ms[COLD:], default=0.0),
+        scan=latencies(driven.scan_ms[COLD_SCANS:]),
+        loop=latencies(driven.loop_ms[COLD_SCANS:]),
+        loop_max_ms=max(driven.loop_ms[COLD_SCANS:], default=0.0),
     )
 
 
@@ -281,15 +281,15 @@ def total(logs: list[LogResult]) -> SlamResult:
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-SIDE_INCHES = 7.0  # [inch] of each map
-DOTS_PER_INCH = 130  # per inch
+SIDE_INCHES = 7.0  # of each map
+DOTS_PER_INCH = 130
 WALLS, DRIVEN, REFERENCE = "#1d2733", "#d9480f", "#1c7ed6"
 
 
 def draw_side_by_side(
     items: Sequence[T], columns: int, draw: Callable[["Axes", T], None], to: Path
 ) -> None:
-    """Draw each item into a picture of its own in a PNG file. Raises ConfigError."""
+    """Draw each item into its own picture in a PNG file. Raises ConfigError."""
     try:
         from matplotlib.figure import Figure
     except ModuleNotFoundError:
@@ -313,7 +313,7 @@ def draw_side_by_side(
 
 
 def draw_logs(drives: Sequence[tuple[LaserLog, MappedLog]], to: Path) -> None:
-    """Draw each map with its path, two in a row. Raises ConfigError."""
+    """Draw each map with its path, two per row. Raises ConfigError."""
     draw_side_by_side(drives, min(len(drives), 2), _draw_log, to)
 
 

@@ -1,4 +1,4 @@
-"""`gigabrain bench slam --world`: maps simulated worlds, and compares poses with the truth."""
+"""`gigabrain bench slam --world`: maps simulated worlds, and compares poses with the true ones."""
 
 import time
 from array import array
@@ -30,28 +30,28 @@ from gigabrain_zenoh.runtime.services import rss_bytes
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-CLOSE_LOOPS_S = 60.0  # so that a slow machine makes the same map
-COLD = 20  # scans before anything is timed
+CLOSE_LOOPS_S = 60.0  # long enough that a slow machine makes the same map
+COLD_SCANS = 20  # without timing, at the start
 TICKS_A_MINUTE = round(60e9 / TICK_NS)
 
 Progress = Callable[[], None]  # called after each minute
 
 
-UNKNOWN = 55  # grey between free and occupied, in percent of black
-WARM_UP = 0.25  # share of the time that the slope leaves out: six hours of eight are judged
-MINUTES_PER_HOUR = 60  # minutes
+UNKNOWN = 55  # grey of unknown cells, in percent of black
+WARM_UP_SHARE = 0.25  # of the time at the start, which the slope leaves out
+MINUTES_PER_HOUR = 60
 
 
 class MapGrowth(Struct, frozen=True, kw_only=True):
-    """Memory of a process that makes a map, and the size of the map."""
+    """Memory of a mapping process, and size of its map."""
 
-    memory_mb: tuple[float, ...]  # each minute of the robot's time
+    memory_mb: tuple[float, ...]  # once a minute of the robot's time
     mb_an_hour: float  # slope of the memory after the first quarter
-    walls: tuple[int, ...]  # occupied cells of the map after each hour, and at the end
+    walls: tuple[int, ...]  # occupied cells after each hour, and at the end
 
     @property
     def most_mb(self) -> float:
-        """The greatest memory of any minute [MB]."""
+        """The largest memory [MB]."""
         return max(self.memory_mb, default=0.0)
 
 
@@ -68,7 +68,7 @@ class GrowthSampler:
         return len(self._memory)
 
     def minute(self, rss_mb: float, grid: OccupancyGrid) -> None:
-        """Add a minute of the robot's time."""
+        """Add the sample of a minute."""
         self._memory.append(rss_mb)
         if self.minutes % MINUTES_PER_HOUR == 0:
             self._walls.append(occupied(grid))
@@ -77,13 +77,14 @@ class GrowthSampler:
         """Return the figures of all samples; `grid` is the map at the end."""
         return MapGrowth(
             memory_mb=tuple(round(one, 1) for one in self._memory),
-            mb_an_hour=slope(self._memory[int(len(self._memory) * WARM_UP) :]) * MINUTES_PER_HOUR,
+            mb_an_hour=slope(self._memory[int(len(self._memory) * WARM_UP_SHARE) :])
+            * MINUTES_PER_HOUR,
             walls=(*self._walls, occupied(grid)),
         )
 
 
 def slope(values: Sequence[float]) -> float:
-    """Return the growth from one value to the next, by linear regression."""
+    """Return the growth per value, by linear regression."""
     return float(np.polyfit(np.arange(len(values)), values, 1)[0]) if len(values) > 1 else 0.0
 
 
@@ -93,7 +94,7 @@ def occupied(grid: OccupancyGrid) -> int:
 
 
 class PoseErrors(Struct, frozen=True, kw_only=True):
-    """Errors of poses against the truth, both from the same start."""
+    """Errors of poses; the true ones begin at the same start."""
 
     mean_m: float
     max_m: float
@@ -119,7 +120,7 @@ class WorldResult(Struct, frozen=True, kw_only=True):
     slam: PoseErrors
     last_minute: PoseErrors
     scan: Latencies
-    growth: MapGrowth  # of this process, simulation included
+    growth: MapGrowth  # of this process, with its simulation
 
 
 class WorldsResult(Struct, frozen=True, kw_only=True):
@@ -130,12 +131,12 @@ class WorldsResult(Struct, frozen=True, kw_only=True):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MappedWorld:
-    """A mapped world, with all that drawing it needs."""
+    """A mapped world, with the data for drawing it."""
 
     result: WorldResult
     grid: OccupancyGrid
-    poses: Floats  # (n, 3), as mapped, in the map
-    truth: Floats  # (n, 3), in the map
+    poses: Floats  # (n, 3), estimated, in the map
+    truth: Floats  # (n, 3), true, in the map
 
 
 def map_world(body: str, world: str, seed: int, minutes: float, progress: Progress) -> MappedWorld:
@@ -146,22 +147,22 @@ def map_world(body: str, world: str, seed: int, minutes: float, progress: Progre
     if (lidar := roaming.body.lidar) is None:
         raise ConfigError(f"{body} has no lidar, and so makes no map")
     run = _MappingRun(SlamMap(CLOSE_LOOPS_S))
-    watch = GrowthSampler()
+    sampler = GrowthSampler()
     for count, one in enumerate(roaming.ticks(round(minutes * TICKS_A_MINUTE)), 1):
         run.fusion.add(one.state, roaming.body)
         if one.scan:
             run.scan(lidar, one.scan, np.array(one.truth))
         if count % TICKS_A_MINUTE == 0:
-            watch.minute(rss_bytes() / 1e6, run.chart.grid())
+            sampler.minute(rss_bytes() / 1e6, run.chart.grid())
             progress()
     if not len(run.poses):
         raise ConfigError(f"--minutes: {minutes:g} is too short for a scan")
     truth, report = roaming.simulation.truth, run.chart.report()
     grid = run.chart.grid()
     run.chart.close()
-    poses, seen, fused = run.poses, run.in_map(), run.fused
-    off = between(seen, poses)
-    begun = compose(poses[0], inverse(fused[0]))
+    poses, true_poses, fused = run.poses, run.in_map(), run.fused
+    off = between(true_poses, poses)
+    map_from_odometry = compose(poses[0], inverse(fused[0]))
     result = WorldResult(
         world=world,
         body=body,
@@ -174,39 +175,39 @@ def map_world(body: str, world: str, seed: int, minutes: float, progress: Progre
         keyframes=report["keyframes"],
         loops=report["loops"],
         drawn_anew=report["drawn_anew"],
-        fused=_errors(between(seen, compose(begun, fused))),
+        fused=_errors(between(true_poses, compose(map_from_odometry, fused))),
         slam=_errors(off),
         last_minute=_errors(off[-600:]),
-        scan=latencies(run.took_ms[COLD:]),
-        growth=watch.growth(grid),
+        scan=latencies(run.took_ms[COLD_SCANS:]),
+        growth=sampler.growth(grid),
     )
-    return MappedWorld(result=result, grid=grid, poses=poses, truth=seen)
+    return MappedWorld(result=result, grid=grid, poses=poses, truth=true_poses)
 
 
 class _MappingRun:
-    """Maps scans and states as perception does, and keeps the poses."""
+    """Maps scans and states like perception, and keeps the poses."""
 
     def __init__(self, chart: SlamMap) -> None:
         self.chart, self.fusion, self.not_localized = chart, OdometryFusion(), 0
-        # flat arrays, so that an hour of them hardly counts in the measured memory
+        # flat arrays: an hour of poses hardly changes the measured memory
         self.took_ms, self._poses, self._fused = array("d"), array("d"), array("d")
         self._truth = array("d")  # in the world
         self._last: OdometrySample | None = None
 
     def scan(self, lidar: Lidar, scan: LaserScan, truth: Floats) -> None:
-        """Add a scan, taken at the pose `truth` (3,)."""
-        moment = self.fusion.at(scan.basis)
-        if moment is None:
+        """Add a scan from the true pose `truth` (3,)."""
+        sample = self.fusion.at(scan.basis)
+        if sample is None:
             return
         ends = np.column_stack(hits(lidar, scan, PerceptionConfig().ignore_below))
-        began = time.thread_time()
+        begin_s = time.thread_time()
         view = view_of(lidar, scan, ends)
-        place = self.chart.step(view, *way(self._last or moment, moment))
-        self.took_ms.append((time.thread_time() - began) * 1e3)
-        self._last = moment
+        place = self.chart.step(view, *way(self._last or sample, sample))
+        self.took_ms.append((time.thread_time() - begin_s) * 1e3)
+        self._last = sample
         self.not_localized += not place.localized
         self._poses.extend(place.pose)
-        self._fused.extend(moment.fused)
+        self._fused.extend(sample.fused)
         self._truth.extend(truth)
 
     @property

@@ -1,4 +1,4 @@
-"""`gigabrain bench stack`: CPU, memory and start of a whole robot, and its first goal."""
+"""`gigabrain bench stack`: CPU, memory and start time of a whole robot, and its first goal."""
 
 import asyncio
 import statistics
@@ -36,18 +36,18 @@ from gigabrain_zenoh.qa.robot_under_test import (
 if TYPE_CHECKING:
     from rich.console import Group
 
-SETTLE_S = 2.0  # imports and first calls are no part of what a running robot costs
-MOVES_RAD_S = 0.2  # of a joint, or [m/s]
+SETTLE_S = 2.0  # imports and first calls do not count
+MIN_JOINT_SPEED = 0.2  # [rad/s] or [m/s], of a moving joint
 PERIOD_S = 1.0  # of the health messages
-SIMULATOR = "driver"  # the process that holds MuJoCo
-EMULATOR = "emulator"  # another one that does, and is the other end of a body's line
+SIMULATOR = "driver"  # process with MuJoCo
+EMULATOR = "emulator"  # process with MuJoCo that answers the driver's bytes
 AHEAD = GoalRequest(x=0.5, y=0.0, source="bench")
-ASK_S, AGAIN_S = 1.0, 0.02
+ASK_TIMEOUT_S, RETRY_S = 1.0, 0.02
 MB = 1e6
 READY = Figure("all ready after", "s").at_most(1.5)
 CPU = Figure("CPU without physics", "%").at_most(30)
 ARM_CPU = Figure("CPU without physics", "%").at_most(35)
-ARM_HZ = 100.0  # of control's commands to an arm on its own bus; simulated, it takes 50
+ARM_HZ = 100.0  # rate of commands to an arm on its own bus; the simulation uses 50
 PHYSICS = Figure("physics and lidar", "%").at_most(5)
 FIRST_GOAL = Figure("first goal accepted after", "s").at_most(2)
 MAX_RSS_MB = 70.0
@@ -57,17 +57,17 @@ class ProcessCost(Struct, frozen=True, kw_only=True):
     """CPU and memory of one process."""
 
     name: str
-    cpu: float  # of one core, mean
-    rss_bytes: int  # most
+    cpu: float  # mean share of one core
+    rss_bytes: int  # largest
 
 
 class FirstGoal(Struct, frozen=True, kw_only=True):
-    """Times from the start of the first process; CPU time is of all processes together."""
+    """Times from the start of the first process. CPU time is the sum of all processes."""
 
     accepted_s: float
     accepted_cpu_s: float
     answer: str  # text of the reply
-    drives_s: float  # until it followed its first path
+    drives_s: float  # until the robot followed its first path
     drives_cpu_s: float
 
 
@@ -78,31 +78,33 @@ class StackResult(Struct, frozen=True, kw_only=True):
     link: LinkName
     world: str
     seconds: float
-    ready_s: float  # from the start of the first process until the last was ready
-    physics_cpu: float | None  # of one core, with the lidar's rays; None for a body without physics
-    arm_hz: float = 0.0  # of commands to an arm that moves meanwhile; 0 for a robot that drives
+    ready_s: float  # from the start of the first process until the last one is ready
+    physics_cpu: float | None  # share of one core, with the lidar's rays; None without physics
+    arm_hz: float = 0.0  # rate of commands to a moving arm; 0 for a robot that drives
     processes: tuple[ProcessCost, ...]
-    first_goal: FirstGoal | None = None  # of the same robot, restarted with a map
+    first_goal: FirstGoal | None = None  # of the same robot, after a restart with a map
 
     @property
     def cpu_without_physics(self) -> float:
-        """CPU of all processes but an emulator together, of one core."""
+        """CPU of all processes except an emulator, without physics, as a share of one core."""
         own = [process.cpu for process in self.processes if process.name != EMULATOR]
         return sum(own) - (self.physics_cpu or 0.0)
 
 
 def targets(result: StackResult) -> dict[Limit, float]:
-    """Return the figures that have a limit. Memory counts in processes without MuJoCo."""
-    used = 100 * result.cpu_without_physics
-    if result.arm_hz:  # decision and safety hold MuJoCo, too
-        return {READY: result.ready_s, ARM_CPU: used}
-    found = {READY: result.ready_s, CPU: used}
+    """Return the figures that have a limit. The memory's limit is for processes without MuJoCo."""
+    cpu_percent = 100 * result.cpu_without_physics
+    if result.arm_hz:  # decision and safety use MuJoCo, too
+        return {READY: result.ready_s, ARM_CPU: cpu_percent}
+    found = {READY: result.ready_s, CPU: cpu_percent}
     if result.physics_cpu is not None:
         found[PHYSICS] = 100 * result.physics_cpu
     if goal := result.first_goal:
         found[FIRST_GOAL] = goal.accepted_s
-    small = [p for p in result.processes if p.name != SIMULATOR or result.physics_cpu is None]
-    largest = max(small, key=lambda process: process.rss_bytes)
+    without_mujoco = [
+        p for p in result.processes if p.name != SIMULATOR or result.physics_cpu is None
+    ]
+    largest = max(without_mujoco, key=lambda process: process.rss_bytes)
     memory = Figure(f"largest without MuJoCo ({largest.name})", "MB").at_most(MAX_RSS_MB)
     return {**found, memory: largest.rss_bytes / MB}
 
@@ -111,10 +113,10 @@ async def measure_stack(
     body: str, link: LinkName, world: str | None, seconds: float, show: Callable[[str], None],
     *, goal: bool = False,
 ) -> StackResult:  # fmt: skip
-    """Run a robot that avoids obstacles, or an arm that carries out the mission of its demo.
+    """Run a robot that avoids obstacles, or an arm that executes the mission of its demo.
 
-    With `goal`, also run one that navigates, for its first goal. Raises ConfigError for an arm that
-    should, and GigabrainError when a process dies.
+    With `goal`, also run a robot that navigates, for its first goal. Raises ConfigError if it is an
+    arm, and GigabrainError when a process dies.
     """
     robot = load_robot(body)
     is_arm = not robot.description().has_base
@@ -135,7 +137,7 @@ async def measure_stack(
         names = list(group.supervisor.statuses)
         healths: defaultdict[str, list[Health]] = defaultdict(list)
         close = bus.subscribe(HEALTH, lambda _key, health: healths[health.process].append(health))
-        before, began_ns = await report_of(bus), bus.clock.now_ns()
+        before, begin_ns = await report_of(bus), bus.clock.now_ns()
         await group.run_for(max(seconds, 2 * PERIOD_S))
         close()
         after, ended_ns = await report_of(bus), bus.clock.now_ns()
@@ -147,7 +149,7 @@ async def measure_stack(
         world=world,
         seconds=seconds,
         ready_s=group.ready_s,
-        physics_cpu=physics_share(before, after, (ended_ns - began_ns) / 1e9),
+        physics_cpu=physics_share(before, after, (ended_ns - begin_ns) / 1e9),
         processes=tuple(_cost(name, healths[name]) for name in names),
         arm_hz=ARM_HZ if is_arm else 0.0,
         first_goal=first_goal,
@@ -155,11 +157,11 @@ async def measure_stack(
 
 
 async def _until_it_moves(group: ProcessGroup, bus: Bus, mission: asyncio.Task[None]) -> None:
-    """Wait until a joint moves: the first plan may take long. Raises what ends the mission."""
+    """Wait until a joint moves: the first plan may take long. Raises the mission's error."""
     moves = asyncio.Event()
 
     def on_state(_key: str, state: RobotState) -> None:
-        if any(abs(joint.velocity) > MOVES_RAD_S for joint in state.joints):
+        if any(abs(joint.velocity) > MIN_JOINT_SPEED for joint in state.joints):
             moves.set()
 
     close = bus.subscribe(STATE, on_state)
@@ -172,7 +174,7 @@ async def _until_it_moves(group: ProcessGroup, bus: Bus, mission: asyncio.Task[N
 def physics_share(
     before: Mapping[str, object], after: Mapping[str, object], seconds: float
 ) -> float | None:
-    """Return the CPU share of the physics thread between two reports, of one core."""
+    """Return the physics thread's share of one core between two reports; None without physics."""
     spent = [report.get("physics_cpu_s") for report in (before, after)]
     if not all(isinstance(value, int | float) for value in spent):
         return None
@@ -190,8 +192,8 @@ def _cost(name: str, healths: Sequence[Health]) -> ProcessCost:
 async def measure_first_goal(body: str, world: str, show: Callable[[str], None]) -> FirstGoal:
     """Start a robot that makes a map, and send it a goal until it accepts and drives.
 
-    Compiles first. Raises ConfigError where navigation is not installed, and GigabrainError when a
-    process dies.
+    Kernels are compiled before. Raises ConfigError if navigation is not installed, and
+    GigabrainError when a process dies.
     """
     for warm_up in (MAP_KERNELS, DRIVE_KERNELS):
         await ensure_compiled(warm_up)
@@ -224,16 +226,16 @@ async def measure_first_goal(body: str, world: str, show: Callable[[str], None])
 
 
 async def _accepted(group: ProcessGroup, bus: Bus) -> tuple[float, float, str]:
-    """Return the time and CPU time [s] at which a goal was accepted, and the reply's text."""
+    """Return the time and CPU time [s] until a goal is accepted, and the reply's text."""
     while True:
-        replies = await bus.ask(GOAL, AHEAD, timeout_s=ASK_S)
+        replies = await bus.ask(GOAL, AHEAD, timeout_s=ASK_TIMEOUT_S)
         if replies and replies[0].ok:
             return group.seconds, group.cpu_s, replies[0].text
-        await asyncio.sleep(AGAIN_S)
+        await asyncio.sleep(RETRY_S)
 
 
 def stack_page(result: StackResult) -> "Group":
-    """Return what `gigabrain bench stack` prints."""
+    """Return the page that `gigabrain bench stack` prints."""
     from rich.console import Group
     from rich.text import Text
 
