@@ -1,5 +1,5 @@
-"""Kernels: functions compiled once by numba, kept on disk, and warmed up before a robot drives.
+"""Kernels: functions that numba compiles once, kept on disk, and loaded before a robot drives.
 
 It may import host.
-Mapping, navigation and the processes that warm them up may import it.
+Mapping, navigation and the processes that load kernels may import it.
 """

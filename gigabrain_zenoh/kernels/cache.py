@@ -14,20 +14,20 @@ PACKAGE = Path(__file__).parents[1]
 HOLDERS = ("kernels", "manipulation", "mapping", "navigation", "qa/bench")  # packages with kernels
 FOLDER = "NUMBA_CACHE_DIR"  # environment variable
 CPU_INFO = Path("/proc/cpuinfo")
-FEATURES = ("flags", "Features")  # of a processor in CPU_INFO: on x86, and on ARM
+FEATURES = ("flags", "Features")  # begin of the line with a processor's features: x86, ARM
 
 
 def kernel_folder() -> Path | None:
-    """Return the folder in use; None for a user without a home."""
+    """Return the folder in use; None for a user without a home directory."""
     chosen = os.environ.get(FOLDER)
     return Path(chosen) if chosen else cache_folder()
 
 
 def cache_folder() -> Path | None:
-    """Return the cache folder for kernels of exactly these sources; None for a user without a home.
+    """Return the cache folder for exactly these sources; None for a user without a home directory.
 
-    Numba notices changes in a kernel's own file only, not in those of the kernels it calls. It
-    finds nothing for the same file at another place, as in a second checkout, or of another time.
+    Numba detects changes only in a kernel's own file, not in those of the kernels that it calls.
+    It also compiles again for a file with another path, as in a second checkout, or another time.
     """
     try:
         return user_cache_path("gigabrain") / f"kernels-{digest(PACKAGE)}"
@@ -38,7 +38,7 @@ def cache_folder() -> Path | None:
 def mark_of(warm_up: str) -> Path | None:
     """Return the file that marks all of `warm_up` as compiled for this processor.
 
-    None if nothing can be kept.
+    None if the cache folder cannot be created.
     """
     folder = kernel_folder()
     if folder is None:
@@ -51,13 +51,13 @@ def mark_of(warm_up: str) -> Path | None:
 
 
 def suffix() -> str:
-    """Return the end of the names of files for these sources and this processor."""
+    """Return the suffix of file names for these sources and this processor."""
     return f"-{digest(PACKAGE)}-{_machine()}"
 
 
 @functools.cache
 def digest(package: Path) -> str:
-    """Return a digest of the sources with kernels, as they are at the first call."""
+    """Return a digest of the packages with kernels, computed at the first call."""
     sources = hashlib.sha256()
     for holder in HOLDERS:
         for source in sorted((package / holder).rglob("*.py")):
@@ -68,7 +68,7 @@ def digest(package: Path) -> str:
 
 @functools.cache
 def _machine() -> str:
-    """Return a digest of the processor, and of what compiles for it."""
+    """Return a digest of the processor and of the versions of the compilers."""
     parts = [sys.version, version("numba"), version("numpy"), platform.machine()]
     try:
         lines = CPU_INFO.read_text().splitlines()

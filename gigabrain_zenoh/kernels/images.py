@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from gigabrain_zenoh.kernels.jit import kernel
 
-OCCUPIED_PERCENT = 50  # a cell of at least this is taken for an obstacle: more likely than not
+OCCUPIED_PERCENT = 50  # from this on, a cell counts as occupied
 Cells = NDArray[np.int8]
 Singles = NDArray[np.float32]
 Bytes = NDArray[np.uint8]
@@ -17,7 +17,7 @@ Ints = NDArray[np.int64]
 
 
 def squared_distance(cells: Cells, cap: int) -> Singles:
-    """Return squared distances in cells to the nearest occupied cell (h, w), by centres.
+    """Return squared distances (h, w) [cells²] to the nearest occupied cell, between centres.
 
     They are at most `cap` squared.
     """
@@ -50,21 +50,24 @@ def _along_columns(cells: Cells, cap: np.float32, out: Singles) -> None:
 
 @kernel
 def _along_rows(out: Singles, cap: int) -> None:
-    """Square, and look `cap` cells to both sides. Slices, not indices: they are vectorised."""
+    """Square distances, and combine those up to `cap` cells to both sides.
+
+    It uses slices, as those are vectorised; indices are not.
+    """
     width = out.shape[1]
-    most = np.float32(cap * cap)
-    padded = np.full(width + 2 * cap, most, np.float32)
+    largest = np.float32(cap * cap)
+    padded = np.full(width + 2 * cap, largest, np.float32)
     for row in range(out.shape[0]):
         here = out[row]
         near = False
         for column in range(width):
             square = here[column] * here[column]
-            near |= square < most
+            near |= square < largest
             here[column] = square
         if not near:
             continue
         middle = padded[cap : cap + width]
-        for column in range(width):  # to assign the slice takes numba seconds to compile
+        for column in range(width):  # numba needs seconds to compile the assignment of a slice
             middle[column] = here[column]
         for aside in range(1, cap):
             left = padded[cap - aside : cap - aside + width]
@@ -77,9 +80,9 @@ def _along_rows(out: Singles, cap: int) -> None:
 
 
 def dilated(image: Bytes, before: int, after: int) -> Bytes:
-    """Return the largest value (h, w) from `before` cells before to `after` cells behind.
+    """Return the largest value (h, w) from `before` cells before to `after` cells after each cell.
 
-    That is in rows and in columns; outside are zeros.
+    This holds for rows and columns. Outside the image are zeros.
     """
     for axis in (0, 1):
         pads = [(0, 0), (0, 0)]
@@ -92,10 +95,10 @@ def dilated(image: Bytes, before: int, after: int) -> Bytes:
 
 @kernel
 def connected_parts(mask: NDArray[np.bool_]) -> tuple[Ints, Ints]:
-    """Return the set cells (n,) of `mask`, as indices into its flat form, part by part.
+    """Return the set cells (n,) of `mask` as flat indices, part by part, and the parts' begins.
 
-    Cells that touch, also by a corner, are one part. The other array (k + 1,) holds where each
-    part begins, and n at its end. Parts are in the order of their first cells.
+    Cells that touch, also at a corner, belong to one part. The second array (k + 1,) has the begin
+    of each part, and n at its end. Parts are in the order of their first cells.
     """
     height, width = mask.shape
     left = mask.copy()

@@ -1,7 +1,7 @@
-"""Functions that run compiled: from a linked library, or else by numba.
+"""Compiled functions, from a linked library or else from numba.
 
-Numba is imported where a kernel is not in a library. It is imported without optional packages that
-are not used here (scipy's BLAS, coverage, cffi): importing those takes as long as loading all
+Numba is only imported if a kernel is not in a library. It is imported without optional packages
+that are not used here (scipy's BLAS, coverage, cffi): their import takes as long as loading all
 kernels.
 """
 
@@ -18,16 +18,16 @@ import numpy as np
 from gigabrain_zenoh.kernels import cache, linked
 
 UNUSED = ("scipy.linalg", "coverage", "cffi")
-# the submodules look for BLAS and cffi; unless imported here, they do so at the first call
+# these submodules look for BLAS and cffi; otherwise that happens at the first call
 PARTS = ("numba", "numba.np.arraymath", "numba.core.typing.cffi_utils")
 
 F = TypeVar("F", bound=Callable[..., object])
-NONE, ONE, TWO = np.int64(0), np.int64(1), np.int64(2)  # as literals they are compiled for apart
+NONE, ONE, TWO = np.int64(0), np.int64(1), np.int64(2)  # each literal would be compiled separately
 
 
 @functools.cache
 def import_numba() -> Any:
-    """Import numba, to keep what it compiles in `cache.kernel_folder`."""
+    """Import numba, with `cache.kernel_folder` as its cache."""
     if folder := cache.cache_folder():
         os.environ.setdefault(cache.FOLDER, str(folder))
     with _as_if_missing(*UNUSED):
@@ -51,11 +51,11 @@ def _as_if_missing(*names: str) -> Iterator[None]:
             del modules[name]
 
 
-unsaved: list[OSError] = []  # why kernels that this process has compiled are not on disk
+unsaved: list[OSError] = []  # errors when this process saved compiled kernels
 
 
 def _if_possible(save: Callable[..., None]) -> Callable[..., None]:
-    """Return `save`, without its errors of the disk: numba would raise them from a kernel."""
+    """Return `save` without its OSErrors, which numba would raise from a kernel."""
 
     def saved(*arguments: object) -> None:
         try:
@@ -73,10 +73,10 @@ class Kernel:
         functools.update_wrapper(self, function)
         self.function, self._lean = function, lean
         self.name = f"{function.__module__}:{function.__qualname__}"
-        self.called = False  # from Python, and run by numba
+        self.called = False  # from Python, with numba
 
     def __call__(self, *arguments: Any) -> Any:
-        """Call it; it runs without the GIL."""
+        """Call the kernel; it runs without the GIL."""
         for takes, function in self._linked:
             if takes(arguments):
                 return function(*arguments)
@@ -85,7 +85,7 @@ class Kernel:
 
     @property
     def overloads(self) -> int:
-        """Number of lists of types that it has been compiled for, in a library or here."""
+        """Number of signatures for which it is compiled, in a library or in this process."""
         here = len(self.dispatcher.signatures) if "dispatcher" in vars(self) else 0
         return len(self._linked) + here
 
@@ -95,35 +95,35 @@ class Kernel:
 
     @functools.cached_property
     def dispatcher(self) -> Any:
-        """The function as numba has it: it is compiled at its first call with other types.
+        """Numba's dispatcher: it compiles the function at the first call with new types.
 
-        The result is kept in NUMBA_CACHE_DIR, or in the user's cache folder. If neither can be
-        written, or the disk is full, each process compiles again.
+        The result is kept in NUMBA_CACHE_DIR, or in the user's cache folder. If that cannot be
+        written, each process compiles again.
         """
         numba, lean = import_numba(), self._lean
         options = {"nogil": True, "error_model": "numpy", "_nrt": not lean, "forceinline": lean}
         try:
-            made = numba.njit(cache=True, **options)(self.function)
+            dispatcher = numba.njit(cache=True, **options)(self.function)
         except RuntimeError:  # numba: no locator available
             return numba.njit(**options)(self.function)
-        made._cache.save_overload = _if_possible(made._cache.save_overload)
-        return made
+        dispatcher._cache.save_overload = _if_possible(dispatcher._cache.save_overload)
+        return dispatcher
 
     @property
     def _numba_type_(self) -> Any:
-        """The type of this function for numba, where a kernel that it compiles calls it."""
+        """Numba's type of this function, for kernels that call it."""
         return self.dispatcher._numba_type_
 
 
 def kernel(function: F) -> F:
-    """Have `function` run compiled."""
+    """Return `function` as a kernel, which is compiled."""
     return cast("F", Kernel(function, lean=False))
 
 
 def lean_kernel(function: F) -> F:
-    """Have a `function` run compiled that makes no arrays and is called very often by kernels.
+    """Return `function` as a kernel for very frequent calls by other kernels.
 
-    It is inlined into its callers, and does not count references to its arrays: counting took
-    longer than the work. Numba refuses one that makes arrays.
+    It is inlined into its callers, without reference counts of its arrays: counting took longer
+    than the work. Numba refuses a function that creates arrays.
     """
     return cast("F", Kernel(function, lean=True))

@@ -1,6 +1,6 @@
-"""Kernels in shared libraries, which run without numba: that alone takes 70 MB and 0.4 s.
+"""Kernels in shared libraries, which run without numba: numba takes 70 MB and 0.4 s.
 
-`linking` writes a library, and beside it an index of its functions with the types that they take.
+`linking` writes a library, and an index of its functions with their argument types.
 """
 
 import functools
@@ -31,7 +31,7 @@ SCALARS: dict[str, tuple[type, ...]] = {
     "float32": (np.float32,),
 }
 Takes = Callable[[Any], bool]
-Overloads = tuple[tuple[Takes, Callable[..., Any]], ...]  # what each takes, and its function
+Overloads = tuple[tuple[Takes, Callable[..., Any]], ...]  # check of arguments, and function
 
 
 class ScalarType(Struct, frozen=True, tag="scalar"):
@@ -45,7 +45,7 @@ class ArrayType(Struct, frozen=True, tag="array"):
 
     dtype: str
     ndim: int
-    contiguous: bool  # in C order; else any
+    contiguous: bool  # in C order; otherwise any layout
 
 
 class TupleType(Struct, frozen=True, tag="tuple"):
@@ -89,13 +89,13 @@ def _array_matcher(dtype: np.dtype[Any], ndim: int, contiguous: bool) -> Takes:
 
 
 def overloads_of(kernel: str) -> Overloads:
-    """Return the overloads of a kernel; none where it is in no library."""
+    """Return the overloads of a kernel; none if it is in no library."""
     return load_all().get(kernel, ())
 
 
 @functools.cache
 def load_all() -> dict[str, Overloads]:
-    """Load the libraries that are there, and return their overloads by kernel."""
+    """Load the existing libraries, and return their overloads by kernel."""
     folder, found = cache.kernel_folder(), dict[str, Overloads]()
     for index in sorted(folder.glob(f"*{cache.suffix()}{INDEX}")) if folder else ():
         try:

@@ -1,7 +1,7 @@
 """Links compiled kernels into a shared library that runs without numba; see `linked`.
 
-It needs a C++ compiler and the header files of Python. Run it in a process of its own: a compiler
-leaves some 200 MB behind.
+It needs a C++ compiler and Python's header files. Run it in its own process: a compiler leaves some
+200 MB behind.
 """
 
 import gc
@@ -34,47 +34,47 @@ numba = import_numba()
 
 
 def link(name: str, warm_ups: Iterable[str]) -> None:
-    """Write a library of all kernels that `warm_ups` call, and its index; nothing if it is there.
+    """Write a library of all kernels that `warm_ups` call, and its index, unless they exist.
 
-    A warm-up is the "module:name" of a function. No kernel may have been called before.
+    A warm-up is the "module:name" of a function. Call this before any kernel.
     """
     folder = cache.kernel_folder()
-    place = folder and folder / f"{name}{cache.suffix()}"
-    if not folder or not place or Path(f"{place}{INDEX}").exists():
+    stem = folder and folder / f"{name}{cache.suffix()}"
+    if not folder or not stem or Path(f"{stem}{INDEX}").exists():
         return
     for warm_up in warm_ups:
         find(warm_up)()
-    with tempfile.TemporaryDirectory(dir=folder) as made:
+    with tempfile.TemporaryDirectory(dir=folder) as temporary:
         library = _library()
-        library.output_dir = made
+        library.output_dir = temporary
         overloads = list(_export(library))
         library.compile()
-        Path(made, library.output_file).replace(f"{place}{LIBRARY}")
-        index = Path(made, "index")
+        Path(temporary, library.output_file).replace(f"{stem}{LIBRARY}")
+        index = Path(temporary, "index")
         index.write_bytes(msgspec.json.encode(overloads))
-        index.replace(f"{place}{INDEX}")
+        index.replace(f"{stem}{INDEX}")
 
 
 def _library() -> Any:
-    """Return an empty library, whose functions are compiled as `kernel` has them compiled."""
+    """Return an empty library with the compiler flags of `kernel`."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", numba.core.errors.NumbaPendingDeprecationWarning)
         pycc: Any = importlib.import_module("numba.pycc")
-    plain = pycc.compiler.Flags
+    default_flags = pycc.compiler.Flags
 
     def flags_of_kernels() -> Any:
-        flags = plain()
+        flags = default_flags()
         flags.release_gil, flags.error_model = True, "numpy"
         return flags
 
-    pycc.compiler.Flags = flags_of_kernels  # a library has no parameter for them
+    pycc.compiler.Flags = flags_of_kernels  # pycc has no parameter for them
     library = pycc.CC(MODULE)
     library.target_cpu = "host"
     return library
 
 
 def _export(library: Any) -> Iterator[Overload]:
-    """Add the kernels to a library, for each list of types with which they were compiled."""
+    """Add the called kernels to a library, for each signature, and yield their overloads."""
     called = [one for one in gc.get_objects() if isinstance(one, Kernel) and one.called]
     for kernel in sorted(called, key=lambda one: one.name):
         signatures = [one.signature for one in kernel.dispatcher.overloads.values()]
@@ -87,7 +87,7 @@ def _export(library: Any) -> Iterator[Overload]:
 
 
 def type_of(known: Any) -> ScalarType | ArrayType | TupleType | None:
-    """Return numba's type as one of ours; None for another, which stays with numba."""
+    """Convert one of numba's types; None if a library cannot take it, so that numba runs it."""
     types = numba.types
     if isinstance(known, types.Array):
         if known.layout == "F" or not (known.mutable and known.aligned):

@@ -1,4 +1,4 @@
-"""Compiles kernels before a process uses them, in a child process where the result can be kept.
+"""Compiles kernels before a process uses them, in a child process if a cache can be written.
 
 A compiler leaves some 200 MB behind in its process.
 """
@@ -24,19 +24,18 @@ from gigabrain_zenoh.kernels import cache, jit
 from gigabrain_zenoh.plugins import find
 
 log = logging.getLogger(__name__)
-QUIET_S = 5.0  # of compiling, before it is logged
-COLLECT_AFTER = 100_000  # new objects; by the standard 700 compiling takes a tenth longer
-TRIES = 2  # to compile, if the child is killed
-LANGUAGES = "CC", "CXX"  # whose compilers linking needs
+QUIET_S = 5.0  # longer compiling is logged
+COLLECT_AFTER = 100_000  # new objects; with the default of 700, compiling takes a tenth longer
+TRIES = 2  # of compiling, if the child is killed
+COMPILERS = "CC", "CXX"  # variables of the compilers that linking needs
 LINKING = "gigabrain_zenoh.kernels.linking"  # a module that imports a compiler
-LAST_NICE = 19  # gets what the robot leaves of the processors
+LAST_NICE = 19  # runs only when no process of the robot does
 
 
 class Kernels:
-    """All kernels that the function at "module:name" calls, for a process that can work meanwhile.
+    """The kernels that the function at "module:name" calls, for a process that can work without.
 
-    Whether a scan already has them goes through `in_time`, so that a replay has them at the same
-    scan.
+    `in_time` decides from which scan on they are used, so that a replay does the same.
     """
 
     def __init__(self, warm_up: str, in_time: InTime) -> None:
@@ -44,10 +43,10 @@ class Kernels:
         self._job: Job = Job()
         self._loading: asyncio.Future[None] | None = None
         self._loaded = False
-        self.beside = False  # whether the process has worked without them
+        self.beside = False  # True if the process works while they are compiled
 
     async def load(self, *, wait: bool) -> None:
-        """Load them. Where they are still to be compiled, return at once unless `wait`.
+        """Load the kernels. If they must be compiled, return at once unless `wait`.
 
         Raises ConfigError if a package for them is not installed.
         """
@@ -62,12 +61,12 @@ class Kernels:
             self._job.set_result(None)
 
     def begin(self) -> None:
-        """Begin to load them beside the event loop, and to compile what is missing; once."""
+        """Begin to load them in the background, and to compile missing ones; only once."""
         if not self._loading and not self._job.done():
             self._loading = asyncio.ensure_future(self._load_beside())
 
     async def finish(self) -> None:
-        """Return once they are loaded. Raises ConfigError as above."""
+        """Wait until they are loaded. Raises ConfigError like `load`."""
         if self._loading:
             await self._loading
 
@@ -79,7 +78,7 @@ class Kernels:
 
     @property
     def loaded(self) -> bool:
-        """True from the scan on at which they can be used. Raises ConfigError as above."""
+        """True from the first scan that can use them. Raises ConfigError like `load`."""
         if self._loading and self._loading.done():
             self._loading.result()
         self._loaded = self._loaded or self._in_time(self._job, 0.0)
@@ -95,7 +94,7 @@ class Kernels:
         self._job.set_result(None)
 
     async def _compile_aside(self) -> None:
-        """Compile in a child; once more if it is killed, as compiling here delays the process."""
+        """Compile in a child, and again if it is killed: compiling here delays this process."""
         join_in()
         data = {"event": "compiling"}
         log.info("compiling, once per installation; works meanwhile", extra={"data": data})
@@ -109,9 +108,9 @@ class Kernels:
 
 
 async def ensure_compiled(warm_up: str) -> None:
-    """Compile and warm up all that the function at "module:name" calls, beside the event loop.
+    """Compile and load the kernels that the function at "module:name" calls, in the background.
 
-    Logs if that takes long. Raises ConfigError if a package for it is not installed.
+    Logs if that takes long. Raises ConfigError if a package for them is not installed.
     """
     try:
         if await asyncio.to_thread(_is_missing, warm_up):
@@ -122,24 +121,24 @@ async def ensure_compiled(warm_up: str) -> None:
 
 
 def missing_package(error: ModuleNotFoundError) -> ConfigError:
-    """Return an error that says what to install."""
+    """Return an error that names the package to install."""
     return ConfigError(f"navigation needs {error.name}: pip install 'gigabrain-zenoh[nav]'")
 
 
 def _is_missing(warm_up: str) -> bool:
-    """Return whether a kernel is still to be compiled, and can be kept."""
+    """Return whether kernels must be compiled and can be kept on disk."""
     mark = cache.mark_of(warm_up)
     return mark is not None and not mark.exists()
 
 
 def is_kept(warm_up: str) -> bool:
-    """Return whether what it calls is compiled, and on disk."""
+    """Return whether the kernels that it calls are compiled and on disk."""
     mark = cache.mark_of(warm_up)
     return mark is not None and mark.exists()
 
 
 def _call(warm_up: str) -> None:
-    find(warm_up)()  # imports too
+    find(warm_up)()  # also imports
 
 
 async def _log_if_slow(work: Awaitable[object]) -> None:
@@ -147,7 +146,7 @@ async def _log_if_slow(work: Awaitable[object]) -> None:
     try:
         done, _ = await asyncio.wait((compiling,), timeout=QUIET_S)
         if not done:
-            join_in()  # a whole minute is too long to go before others
+            join_in()  # compile at normal priority: it takes a minute
             data = {"event": "compiling"}
             log.info("compiling: the first start takes about a minute", extra={"data": data})
         await compiling
@@ -156,7 +155,7 @@ async def _log_if_slow(work: Awaitable[object]) -> None:
 
 
 async def compile_in_child(warm_up: str, *, step_aside: bool = False) -> int:
-    """Compile in a child process, and return its exit code; with `step_aside` others go first."""
+    """Compile in a child process, and return its exit code; `step_aside` lowers its priority."""
     aside = ("aside",) if step_aside else ()
     return await _in_child(f"compiling {warm_up}", __name__, warm_up, str(os.getpid()), *aside)
 
@@ -170,7 +169,7 @@ async def link_in_child(library: str, *warm_ups: str) -> int:
 async def _in_child(doing: str, module: str, *arguments: str) -> int:
     paths = os.pathsep.join(path for path in sys.path if path)
     child = await asyncio.create_subprocess_exec(
-        *(sys.executable, "-P", "-m", module),  # -P: nothing is imported from the current folder
+        *(sys.executable, "-P", "-m", module),  # -P: do not import from the current folder
         *arguments,
         env={**os.environ, "PYTHONPATH": paths},
         stdin=asyncio.subprocess.DEVNULL,
@@ -179,9 +178,9 @@ async def _in_child(doing: str, module: str, *arguments: str) -> int:
     )
     try:
         _, errors = await child.communicate()
-        if child.returncode and (said := errors.decode(errors="replace").strip()):
-            log.warning("%s beforehand failed: %s", doing, said.splitlines()[-1])
-            log.debug("%s", said)
+        if child.returncode and (text := errors.decode(errors="replace").strip()):
+            log.warning("%s beforehand failed: %s", doing, text.splitlines()[-1])
+            log.debug("%s", text)
         return child.returncode or 0
     finally:
         if child.returncode is None:
@@ -190,19 +189,19 @@ async def _in_child(doing: str, module: str, *arguments: str) -> int:
 
 
 def can_link() -> bool:
-    """Return whether this machine has what linking takes: compilers, Python.h and setuptools."""
-    compilers = (os.environ.get(one) or sysconfig.get_config_var(one) for one in LANGUAGES)
+    """Return whether linking is possible: with compilers, Python.h and setuptools."""
+    compilers = (os.environ.get(one) or sysconfig.get_config_var(one) for one in COMPILERS)
     headers = Path(sysconfig.get_path("include"), "Python.h")
-    there = headers.exists() and find_spec("setuptools")
-    return bool(there) and all(one and shutil.which(one.split()[0]) for one in compilers)
+    has_files = headers.exists() and find_spec("setuptools")
+    return bool(has_files) and all(one and shutil.which(one.split()[0]) for one in compilers)
 
 
 def compile_all(warm_up: str) -> None:
-    """Compile here, and mark it as done where it can be kept. Raises ModuleNotFoundError."""
+    """Compile in this process, and mark it as done on disk. Raises ModuleNotFoundError."""
     find(warm_up)()
     mark = cache.mark_of(warm_up)
     if mark and not jit.unsaved:
-        with contextlib.suppress(OSError):  # read only, or full: as if nothing was kept
+        with contextlib.suppress(OSError):  # read-only or full: compile again next time
             replace_file(mark, b"compiled\n")
 
 

@@ -1,4 +1,4 @@
-"""Imported by a fork server: its forks share the linked kernels, or what numba makes at first."""
+"""Imported by a fork server: its forks share the linked kernels, or else numba's first set-up."""
 
 from gigabrain_zenoh.kernels.jit import import_numba
 from gigabrain_zenoh.kernels.linked import load_all

@@ -1,5 +1,5 @@
 """Examines the product: the fault suite, benchmarks and the conformance kit of drivers.
 
-It may import everything but cli, the drivers included.
+It may import everything except cli, also the drivers.
 Only the commands may import it.
 """

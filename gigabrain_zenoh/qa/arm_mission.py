@@ -11,15 +11,15 @@ from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.client.tasks import Tasks
 from gigabrain_zenoh.errors import ConfigError
 
-LOOK_S = 0.5  # between two looks at whether it goes on
+LOOK_S = 0.5  # between two requests of the mission's state
 
 
 @asynccontextmanager
 async def repeated_mission(bus: Bus, body: str) -> AsyncIterator[asyncio.Task[None]]:
-    """Have an arm carry out the mission of its demo, from the beginning when it has ended.
+    """Let an arm execute the mission of its demo, again and again, during the block.
 
-    The task that sees to it ends where the robot refuses. Raises ConfigError for a body that has no
-    mission.
+    The yielded task ends with an error when the robot refuses. Raises ConfigError for a body
+    without a mission.
     """
     mission = load_robot(body).demo.mission
     if not mission:

@@ -1,6 +1,6 @@
-"""A short drive in each world, and one with a map, for the process replay in the tests.
+"""Records a short drive in each world, and one with a map, for the tests' process replay.
 
-`python -m gigabrain_zenoh.qa.drives FOLDER` records them again after an intended change.
+After an intended change, run `python -m gigabrain_zenoh.qa.drives FOLDER`.
 """
 
 import asyncio
@@ -9,7 +9,7 @@ from pathlib import Path
 
 from msgspec import Struct
 
-import gigabrain_zenoh.recording.arithmetic  # noqa: F401  before anything imports numpy
+import gigabrain_zenoh.recording.arithmetic  # noqa: F401  must precede numpy
 from gigabrain_zenoh.config.settings import DecisionConfig, PerceptionConfig, RecorderConfig
 from gigabrain_zenoh.errors import GigabrainError
 from gigabrain_zenoh.launch.demo import Demo, DemoOptions
@@ -17,8 +17,8 @@ from gigabrain_zenoh.launch.deployment import ROBOT, Deployment
 from gigabrain_zenoh.launch.processes import node_of
 from gigabrain_zenoh.recording.process_replay import OUTPUTS, replay_process, settings_for
 
-AVOIDS = ("state", "body", "scan", "world", "intent", "cmd_vel", "safety")
-NAVIGATES = (*AVOIDS, "pose", "map", "task", "request_log", "input_log")
+AVOID_TOPICS = ("state", "body", "scan", "world", "intent", "cmd_vel", "safety")
+NAVIGATE_TOPICS = (*AVOID_TOPICS, "pose", "map", "task", "request_log", "input_log")
 ATTEMPTS = 5
 
 
@@ -28,13 +28,13 @@ class RecordedDrive(Struct, frozen=True):
     world: str
     seed: int
     seconds: float = 3.2
-    topics: tuple[str, ...] = AVOIDS
+    topics: tuple[str, ...] = AVOID_TOPICS
     perception: PerceptionConfig = PerceptionConfig()
     decision: DecisionConfig = DecisionConfig()
 
 
 EXPLORES = RecordedDrive(
-    "house", 1, 3.2, NAVIGATES,
+    "house", 1, 3.2, NAVIGATE_TOPICS,
     PerceptionConfig(mapping="slam"),
     DecisionConfig(behaviour="navigate", settings={"start": "explore"}),
 )  # fmt: skip

@@ -1,8 +1,8 @@
-"""Judges module names in strings by the order of rooms, and prints the size of the code.
+"""Checks module names in strings against the order of rooms, and prints the size of the code.
 
-Started in a checkout as `python -m gigabrain_zenoh.qa.house`, or with the word `sizes` behind it.
-import-linter sees import statements; a name in a string (`"gigabrain_zenoh.safety.node:run"`)
-reaches a module as well, and has to keep the same order. Ends with 1 where one does not.
+Run it in a checkout as `python -m gigabrain_zenoh.qa.house`, or with the argument `sizes`.
+import-linter checks only import statements. A name in a string, such as
+`"gigabrain_zenoh.safety.node:run"`, must keep the same order. If one does not, it exits with 1.
 """
 
 import ast
@@ -18,10 +18,10 @@ from typing import NamedTuple
 ROOT = Path(__file__).parents[2]
 PACKAGES = ("gigabrain_zenoh", "drivers/gigabrain_drivers", "schemas/gigabrain_schemas")
 NAME = re.compile(r"gigabrain_(?:zenoh|drivers|schemas)(?:\.\w+)+")
-BEGINS = re.compile(r"""["'}]gigabrain_""")  # a string that may be such a name
+LIKELY = re.compile(r"""["'}]gigabrain_""")  # quick check for such a string
 MAX_FUNCTION_LINES, MAX_FILE_LINES, MIN_FILE_LINES = 50, 450, 50
 ROOMS = "each room names only rooms below it"
-BY_NAME = ("launch", "gigabrain_drivers")  # the table of processes names what runs a driver
+BY_NAME = ("launch", "gigabrain_drivers")  # allowed: the table of processes names the driver's
 
 Modules = Mapping[str, Path]
 
@@ -44,10 +44,10 @@ def room_of(module: str) -> str:
 
 
 class Rules(NamedTuple):
-    """The contracts of import-linter, as far as strings are judged by them."""
+    """The contracts of import-linter that also hold for strings."""
 
-    floor: Mapping[str, int]  # of each room, 0 for the top
-    forbidden: Sequence[tuple[str, str, str]]  # who must not import what, and the contract's name
+    floor: Mapping[str, int]  # layer of each room, 0 for the top
+    forbidden: Sequence[tuple[str, str, str]]  # importer, imported, name of the contract
 
     def broken_by(self, module: str, name: str) -> str:
         """Return the contract that `module` breaks when it names `name`; empty for none."""
@@ -86,8 +86,8 @@ def rules(root: Path) -> Rules:
 def names_in_strings(path: Path, known: Modules) -> Iterator[tuple[int, str]]:
     """Yield the modules that are named in strings of a file, each with its line."""
     source = path.read_text("utf-8")
-    if not BEGINS.search(source):
-        return  # to parse all files takes a second
+    if not LIKELY.search(source):
+        return  # saves a second, as parsing is slow
     for node in ast.walk(ast.parse(source)):
         if isinstance(node, ast.Constant) and isinstance(node.value, str):
             text = node.value.partition(":")[0]
@@ -124,7 +124,7 @@ def size_of(paths: Sequence[Path]) -> Size:
 
 
 def long_functions(paths: Sequence[Path]) -> list[str]:
-    """Return the names of all functions that are longer than a screen, docstrings not counted."""
+    """Return the names of all functions that are longer than a screen, without docstrings."""
     found = []
     for path in paths:
         for node in ast.walk(ast.parse(path.read_text("utf-8"))):
@@ -176,7 +176,7 @@ def show(root: Path) -> None:
 
 
 def main() -> None:
-    """Print what is named in strings against the order of rooms, or the sizes."""
+    """Print the names in strings that break the order of rooms, or print the sizes."""
     if sys.argv[1:] == ["sizes"]:
         show(ROOT)
         return

@@ -23,11 +23,11 @@ from gigabrain_zenoh.runtime.replay import Node
 Q = TypeVar("Q", bound=Message)
 R = TypeVar("R", bound=Message)
 
-ANSWER_S = 30.0  # of wall time: an answer may need work in a thread
+ANSWER_TIMEOUT_S = 30.0  # wall time: a reply may need work in a thread
 
 
 class InMemoryRobot:
-    """Nodes on one network in memory; the last one makes the ticks. Used as `async with`."""
+    """Nodes on a network in memory; the last one publishes the ticks. Use it in `async with`."""
 
     def __init__(self, nodes: Mapping[str, Node]) -> None:
         self._nodes = nodes
@@ -54,14 +54,14 @@ class InMemoryRobot:
         await self.operator.close()
 
     async def tick(self) -> None:
-        """Let 20 ms pass. Raises the error that ended a node."""
+        """Advance time by 20 ms. Raises the error that ended a node."""
         await self._clock.advance(TICK_NS)
         self._network.sent.clear()
         self._check()
 
     async def ask(self, service: Service[Q, R], request: Q) -> list[R]:
-        """Ask the nodes while time stands still. Raises Refused."""
-        return await self.operator.ask(service, request, timeout_s=ANSWER_S)
+        """Send a request to the nodes; time does not advance. Raises Refused."""
+        return await self.operator.ask(service, request, timeout_s=ANSWER_TIMEOUT_S)
 
     def _check(self) -> None:
         for running, _ in self._running.values():
@@ -77,7 +77,7 @@ class ExternalPlant(Protocol):
         ...
 
     def state(self) -> RobotState:
-        """Return the body's state, as measured."""
+        """Return the body's measured state."""
         ...
 
     def scan(self) -> LaserScan | None:
@@ -86,24 +86,24 @@ class ExternalPlant(Protocol):
 
 
 class ExternalPlantDriver(Driver):
-    """Drives an external plant, a tick at a time."""
+    """Drives an external plant tick by tick."""
 
     def __init__(self, robot: RobotFile, plant: ExternalPlant) -> None:
         super().__init__(robot, None, Run(folder=Path()))
         self._plant, self._velocity = plant, ZERO
 
     async def open(self) -> None:
-        """Do nothing; there is nothing to connect to."""
+        """Do nothing: there is no connection."""
 
     async def close(self) -> None:
-        """Do nothing; there is nothing to close."""
+        """Do nothing: there is no connection."""
 
     async def stop(self) -> None:
         """Command zero from the next tick on."""
         self._velocity = ZERO
 
     async def ticks(self, clock: Clock) -> AsyncIterator[int]:
-        """Yield ticks by the clock; scans come between two states, as from a real lidar."""
+        """Yield ticks by the clock; publish scans between two states, like a real lidar."""
         async for passed in super().ticks(clock):
             for _ in range(passed):
                 self._plant.advance(self._velocity)

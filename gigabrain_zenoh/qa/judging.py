@@ -23,21 +23,21 @@ Stage = Literal["sim", "auto", "line", "serial", "tcp", "arm", ""]
 
 
 class Failed(GigabrainError):
-    """The robot or driver broke a promise, or an awaited event never came."""
+    """The robot or driver broke a promise, or an expected event did not happen."""
 
 
 class Skipped(GigabrainError):
-    """The test does not apply here; the text says why. Never counts as passed."""
+    """The test does not apply here; the text is the reason. It never counts as passed."""
 
 
 @dataclass(frozen=True)
 class Figure:
-    """A measured quantity. Functions return values by figure, rows limit them by figure."""
+    """A measured quantity: the key for measured values and their limits."""
 
     name: str
     unit: str = ""
-    wall: bool = False  # in wall time, which grows on a busy or slow machine
-    long: bool = False  # measured in the long form only
+    wall: bool = False  # wall time, which grows on a busy or slow machine
+    long: bool = False  # measured only in the long form of a test
 
     def at_most(self, value: float) -> "Limit":
         """Return the limit `value` [unit] of this figure."""
@@ -69,7 +69,7 @@ def coloured(verdict: Verdict) -> str:
 
 
 def worse_of(one: Measured, other: Measured) -> dict[Figure, float]:
-    """Return all figures of both; the greater value where both have one."""
+    """Return the figures of both; the larger value if both have one."""
     return {
         figure: max(m[figure] for m in (one, other) if figure in m) for figure in {**one, **other}
     }
@@ -78,7 +78,7 @@ def worse_of(one: Measured, other: Measured) -> dict[Figure, float]:
 class Latencies(Struct, frozen=True, kw_only=True):
     """Latencies of one run, or of several."""
 
-    n: int  # how many were measured
+    n: int  # number of measured latencies
     p50_ms: float
     p99_ms: float
 
@@ -93,7 +93,7 @@ def latencies(times_ms: Sequence[float]) -> Latencies:
 
 
 def over_rounds(rounds: Sequence[Latencies]) -> Latencies:
-    """Return the median round, figure by figure, so that one disturbed round does not count."""
+    """Return the median over rounds for each figure, so that a disturbed round does not count."""
     return Latencies(
         n=sum(one.n for one in rounds),
         p50_ms=statistics.median(one.p50_ms for one in rounds),
@@ -108,7 +108,7 @@ def table_of(*columns: str, title: str | None = None, left: int = 1) -> "Table":
 
     table = Table(title=title)
     for number, name in enumerate(columns):
-        is_text = number < left  # the heads of figures may take two lines
+        is_text = number < left  # headers of figures may take two lines
         table.add_column(Text(name), justify="left" if is_text else "right", no_wrap=is_text)
     return table
 
@@ -126,8 +126,8 @@ class Finding(NamedTuple):
 
     ok: bool
     measured: str
-    times_ms: Mapping[str, float] = {}  # since the fault, of a check that can be repeated
-    late_ms: float = 0.0  # by how much it missed a time, where nothing else is wrong
+    times_ms: Mapping[str, float] = {}  # since the fault, for a repeatable check
+    late_ms: float = 0.0  # excess over a time limit, if nothing else is wrong
 
 
 class DriverCheckResult(NamedTuple):
@@ -160,10 +160,10 @@ class FaultRow:
 
     number: int
     test: FaultTest
-    stage: Stage  # which shared robot it needs; none for a test that boots its own
+    stage: Stage  # shared robot that it needs; empty for a test that boots its own
     limits: tuple[Limit, ...]
-    needs: tuple[str, ...] = ()  # keys, recorder, nav: extras that may be missing
-    loads: bool = False  # the fault itself keeps the cores busy
+    needs: tuple[str, ...] = ()  # optional extras: keys, recorder, nav
+    loads: bool = False  # True if the fault itself keeps the cores busy
 
     @property
     def name(self) -> str:
@@ -184,7 +184,7 @@ class FaultRow:
 def fault_row(
     number: int, stage: Stage, *limits: Limit, needs: tuple[str, ...] = (), loads: bool = False
 ) -> Callable[[FaultTest], FaultRow]:
-    """Make a row of the decorated function. The suite finds all rows in the package `rows`."""
+    """Make the decorated function a row. The suite finds all rows in the package `rows`."""
 
     def row(test: FaultTest) -> FaultRow:
         return FaultRow(number, test, stage, limits, needs, loads)
@@ -198,8 +198,8 @@ class FaultRun(Struct, frozen=True, kw_only=True):
     verdict: Verdict
     reason: str = ""  # why it failed or was skipped
     measured: dict[str, float] = {}
-    waited_ms: float = 0.0  # longest wait of one of the robot's threads for a core, within 0.1 s
-    disturbed: bool = False  # it waited so long that the run does not count, passed or failed
+    waited_ms: float = 0.0  # longest wait of a thread of the robot for a core, per 0.1 s
+    disturbed: bool = False  # True if that wait was too long for the run to count
     seconds: float = 0.0  # of wall time
 
 
@@ -211,12 +211,12 @@ class FaultResult(Struct, frozen=True, kw_only=True):
     criterion: str
     verdict: Verdict
     reason: str = ""  # why it failed or was skipped
-    worst: dict[str, float] = {}  # the greatest of all runs that count, by figure
+    worst: dict[str, float] = {}  # the largest value of all counted runs, by figure
     tries: tuple[FaultRun, ...] = ()
 
 
 def conclude(row: FaultRow, runs: Sequence[FaultRun]) -> FaultResult:
-    """Judge the undisturbed runs; all of them where each was disturbed."""
+    """Judge the undisturbed runs; if there are none, judge all."""
     counted = [one for one in runs if not one.disturbed] or list(runs)
     decisive = next((one for one in counted if one.verdict != "passed"), counted[-1])
     measured = [one.measured for one in counted if one.measured]
@@ -234,7 +234,7 @@ def conclude(row: FaultRow, runs: Sequence[FaultRun]) -> FaultResult:
 def judge(
     row: FaultRow, measured: Measured, *, wall: bool = True, long: bool = False
 ) -> tuple[Verdict, str]:
-    """Return the verdict on one run, and why it failed; without `wall`, not by the wall clock."""
+    """Return a run's verdict and the reason of a failure; `wall` includes wall-time figures."""
     limits = [limit for limit in row.limits if long or not limit.figure.long]
     if set(measured) != {limit.figure for limit in limits}:
         raise ValueError(f"{row.name} is judged by {row.criterion!r}, not by {measured}")
@@ -245,7 +245,7 @@ def judge(
 
 
 def worst_of(row: FaultRow, runs: Sequence[Mapping[str, float]]) -> dict[str, float]:
-    """Return the greatest value of each figure, by name; NaN is worse than any number."""
+    """Return the largest value of each figure, by name; NaN is worse than any number."""
     names = [limit.figure.name for limit in row.limits]
     return {
         name: max((run[name] for run in runs if name in run), key=_badness)

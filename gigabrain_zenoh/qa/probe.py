@@ -34,15 +34,15 @@ from gigabrain_zenoh.host.bounded import percentile
 from gigabrain_zenoh.qa.judging import Failed
 from gigabrain_zenoh.runtime.connect import connect
 
-PATIENCE_S = 60.0  # far more than anything here takes on a busy machine
+PATIENCE_S = 60.0  # far longer than any event here on a busy machine
 POLL_S = 0.01
-AT_REST = 0.005  # [m/s], [rad/s]
-STRAIGHT = 0.02  # [rad/s]
+MAX_REST_SPEED = 0.005  # [m/s], [rad/s]
+MAX_STRAIGHT_TURN = 0.02  # [rad/s]
 NODES = ("driver", "perception", "decision", "control", "safety")
 
 
 async def until(condition: Callable[[], object], what: str, within_s: float = PATIENCE_S) -> None:
-    """Wait for `condition`. Raises Failed naming `what` when it does not come true in time."""
+    """Wait until `condition` is true. Raises Failed with `what` when time is up."""
     loop = asyncio.get_running_loop()
     end_s = loop.time() + within_s
     while not condition():
@@ -52,13 +52,13 @@ async def until(condition: Callable[[], object], what: str, within_s: float = PA
 
 
 class Probe:
-    """Keeps what a robot publishes: states, commands of the brain, health and logs."""
+    """Collects a robot's messages: states, the brain's commands, health and logs."""
 
     def __init__(self, bus: Bus) -> None:
         self.bus = bus
         self.states: deque[RobotState] = deque(maxlen=50_000)
         self.commands: deque[CmdVel] = deque(maxlen=10_000)  # of the brain
-        self.arrivals: deque[int] = deque(maxlen=10_000)  # tick at which each of them arrived
+        self.arrivals: deque[int] = deque(maxlen=10_000)  # tick of each command's arrival
         self._ignores_commands = False
         self._unsubscribe_commands: Close | None = None
         self.health: dict[str, Health] = {}
@@ -78,7 +78,7 @@ class Probe:
 
     @property
     def causes(self) -> set[str]:
-        """Codes of the causes for which the gate is shut now."""
+        """Codes of the causes for which the gate is shut."""
         return {cause.code for cause in self.state.gate.causes}
 
     def since(self, start: RobotState) -> list[RobotState]:
@@ -127,7 +127,7 @@ class Probe:
         raise Failed(f"{process} does not answer")
 
     async def pid(self, process: str) -> int:
-        """Return the pid under which a process answers."""
+        """Return the pid of the process that answers by this name."""
         return (await self.describe(process)).pid
 
     async def pids(self) -> dict[str, int]:
@@ -135,17 +135,17 @@ class Probe:
         return {name: await self.pid(name) for name in NODES}
 
     async def truth(self) -> dict[str, Any]:
-        """Return the driver's report, which holds the simulation's truth."""
+        """Return the driver's report, which has the simulation's true values."""
         return dict((await self.describe("driver")).report)
 
     async def driving_straight(
-        self, speed: float = 0.25, room: float = 1.3, turning: float = STRAIGHT,
+        self, speed: float = 0.25, room: float = 1.3, turning: float = MAX_STRAIGHT_TURN,
         *, by_hand: bool = False,
     ) -> None:  # fmt: skip
         """Wait until the robot drives straight at `speed` [m/s] with `room` [m] ahead.
 
-        Turning by less than `turning` [rad/s] counts as straight. `by_hand` enables the brain as a
-        person would, again each time that a busy machine shuts the gate.
+        Turning by less than `turning` [rad/s] counts as straight. With `by_hand`, enable the brain
+        like a person, again each time that a busy machine shuts the gate.
         """
 
         def driving() -> bool:
@@ -155,8 +155,8 @@ class Probe:
             if self.state.gate.mode != "enabled":
                 return False  # the measured speed may be older than the gate's closing
             velocity, ahead = self.state.velocity, world.sectors[0]
-            roomy = ahead is None or ahead > room
-            return roomy and velocity.linear_x > speed and abs(velocity.angular_z) < turning
+            is_free = ahead is None or ahead > room
+            return is_free and velocity.linear_x > speed and abs(velocity.angular_z) < turning
 
         async def enable() -> None:
             while True:
@@ -171,7 +171,7 @@ class Probe:
                 enabling.cancel()
 
     async def enable_brain(self) -> None:
-        """Enable the brain as a person would, as soon as the gate agrees."""
+        """Enable the brain like a person; repeat until the gate agrees."""
         while True:
             replies = await self.bus.ask(ENABLE, EnableRequest(source=BRAIN))
             if replies and replies[0].ok:
@@ -191,7 +191,7 @@ class Probe:
         return enabled
 
     async def at_rest(self, ticks: int = 10) -> None:
-        """Wait until the body has been at rest for `ticks` of one boot."""
+        """Wait until the body is at rest for `ticks` of one boot."""
         begin = self.state
 
         def resting() -> bool:
@@ -206,7 +206,7 @@ class Probe:
         await until(resting, f"at rest for {ticks} ticks")
 
     async def ticks(self, count: int) -> None:
-        """Wait for `count` ticks of the robot; counted from a new boot where one begins."""
+        """Wait for `count` ticks of the robot; if it boots, count from there."""
         begin = self.state
 
         def passed() -> bool:
@@ -216,11 +216,11 @@ class Probe:
         await until(passed, f"{count} more ticks")
 
     def distance_from(self, start: RobotState) -> float:
-        """Return the distance of the body from its place at `start` [m]."""
+        """Return the distance of the body from its position in `start` [m]."""
         return math.dist((start.pose.x, start.pose.y), (self.state.pose.x, self.state.pose.y))
 
     def stops(self, start: RobotState) -> list[int]:
-        """Return the ticks since `start` in which the gate left `enabled`."""
+        """Return the ticks since `start` at which the gate left `enabled`."""
         pairs = itertools.pairwise(self.since(start))
         return [b.tick for a, b in pairs if a.gate.mode == "enabled" != b.gate.mode]
 
@@ -230,7 +230,7 @@ class Probe:
         return sum((a.gate.mode == "enabled") != (b.gate.mode == "enabled") for a, b in pairs)
 
     def control_period_ms(self, start: RobotState) -> float:
-        """Return control's period since `start` (p99), in the robot's own time [ms]."""
+        """Return the p99 of control's period since `start`, in the robot's time [ms]."""
         ticks = [c.tick for c in self.commands if c.boot == start.boot and c.tick > start.tick]
         periods = sorted((b - a) * TICK_MS for a, b in itertools.pairwise(ticks))
         p99_ms = percentile(periods, 0.99)
@@ -240,7 +240,7 @@ class Probe:
         return p99_ms
 
     def travel_until_rest(self, start: RobotState) -> float:
-        """Return the path by odometry from `start` until the body first came to rest [m]."""
+        """Return the odometry's path length from `start` to the first rest [m]. Raises Failed."""
         path_m = path_until_rest(self.since(start), at_rest)
         if path_m is None:
             raise Failed("the body has not come to rest")
@@ -250,7 +250,7 @@ class Probe:
 def path_until_rest(
     states: Sequence[RobotState], rests: Callable[[RobotState], bool]
 ) -> float | None:
-    """Return the path by odometry from the first state until the body rests [m], if it does."""
+    """Return the odometry's path length from the first state to rest [m]; None without rest."""
     path_m = 0.0
     for before, state in itertools.pairwise(states):
         path_m += math.hypot(state.pose.x - before.pose.x, state.pose.y - before.pose.y)
@@ -262,7 +262,7 @@ def path_until_rest(
 def at_rest(state: RobotState) -> bool:
     """Return whether the body stands still."""
     velocity = state.velocity
-    return abs(velocity.linear_x) < AT_REST and abs(velocity.angular_z) < AT_REST
+    return abs(velocity.linear_x) < MAX_REST_SPEED and abs(velocity.angular_z) < MAX_REST_SPEED
 
 
 def moving(states: list[RobotState], above: float) -> int:
@@ -272,7 +272,7 @@ def moving(states: list[RobotState], above: float) -> int:
 
 @asynccontextmanager
 async def probing(endpoint: Endpoint, name: str = "probe") -> AsyncIterator[Probe]:
-    """Join a robot's network; waits for its router and its first state."""
+    """Connect to a robot; wait for its router and its first state."""
     async with connect(endpoint, name, timeout_s=None) as bus:
         probe = Probe(bus)
         await until(lambda: probe.states, "the robot's first state")

@@ -32,24 +32,24 @@ from gigabrain_zenoh.runtime.supervisor import Supervisor
 
 LOOPBACK = "tcp/127.0.0.1:0"
 Change = Callable[[list[ProcessSpec]], list[ProcessSpec]]
-# a process that is killed often is restarted each time: giving up has a test of its own
+# restart a process after each of its many kills; another test checks giving up
 NEVER_GIVE_UP = Backoff(factor=1.0, deaths=10_000)
 FAULTS_FILE = "faults.json"  # read by the emulator's process
 STOP_S = 1.5
-BENCH_START_S = 30.0  # longer than anything takes to start on a busy machine
-START_S = 300.0  # far more than it takes to compile what a navigating robot calls
+BENCH_START_S = 30.0  # longer than any start on a busy machine
+START_S = 300.0  # far longer than compiling a navigating robot's kernels
 ASK_S = 0.5
-PROMPT_S = 0.005  # an older answer is too old to count from
+PROMPT_S = 0.005  # age limit of a prompt answer
 POLL_S = 0.02
-# turn rate that counts as straight [rad/s], and share of the speed that counts as full
+# largest turn rate that counts as straight, and least share of the speed that counts as full
 STRAIGHT_RAD_S, FULL_SPEED = 0.1, 0.96
 STRAIGHT_ON_ROUTE_RAD_S, FULL_SPEED_ON_ROUTE = 0.3, 0.6  # routes bend; a busy host drives slower
 
 
 class ProcessGroup:
-    """Processes under the supervisor that `up` uses. Used as `async with`.
+    """Processes under the supervisor that `up` uses. Use it in `async with`.
 
-    Where `strict`, any death of a process ends the measurement.
+    With `strict`, any death of a process ends the measurement.
     """
 
     def __init__(
@@ -59,15 +59,15 @@ class ProcessGroup:
         self.supervisor = Supervisor(
             specs, self._record, backoff or Backoff(), keep_stuck=keep_stuck
         )
-        self.records: list[Mapping[str, Any]] = []  # of all logs
-        self.ready_s = 0.0  # from the first start until all were ready
+        self.records: list[Mapping[str, Any]] = []  # log records of all processes
+        self.ready_s = 0.0  # from the first start until all are ready
         self._strict = strict
-        self._began_s = 0.0
+        self._begin_s = 0.0
         self._running: asyncio.Task[None] | None = None
         self._stack = AsyncExitStack()
 
     async def __aenter__(self) -> Self:
-        self._began_s = asyncio.get_running_loop().time()
+        self._begin_s = asyncio.get_running_loop().time()
         await self._stack.enter_async_context(self.supervisor)
         self._running = asyncio.create_task(self.supervisor.run())
         self._stack.push_async_callback(self._end)
@@ -89,11 +89,11 @@ class ProcessGroup:
     @property
     def seconds(self) -> float:
         """Time since the first start [s]."""
-        return asyncio.get_running_loop().time() - self._began_s
+        return asyncio.get_running_loop().time() - self._begin_s
 
     @property
     def pids(self) -> dict[str, int]:
-        """Pids of all processes that run, by name."""
+        """Pids of all running processes, by name."""
         return {name: one.pid for name, one in self.supervisor.statuses.items() if one.pid}
 
     @property
@@ -118,11 +118,11 @@ class ProcessGroup:
         if self.supervisor.given_up:
             raise Failed(f"{', '.join(self.supervisor.given_up)} cannot be started")
         if self._strict and self.supervisor.deaths:
-            why = self._complaint(self.supervisor.statuses)
-            raise Failed(f"a process died during the measurement: {why}")
+            reason = self._complaint(self.supervisor.statuses)
+            raise Failed(f"a process died during the measurement: {reason}")
 
     def _complaint(self, names: Collection[str]) -> str:
-        """Return why one of these processes failed."""
+        """Return the error text of these processes; empty if there is none."""
         records = [r for r in self.records if r.get("child", r["process"]) in names]
         failed = [r for r in records if r.get("event") == "failed"]
         errors = [r for r in records if r.get("level") in ("error", "critical")]
@@ -157,7 +157,7 @@ class ProcessGroup:
 
 @asynccontextmanager
 async def client(endpoint: Endpoint) -> AsyncIterator[Bus]:
-    """Open a session that costs the robot nothing until it subscribes to something."""
+    """Open a session; it does not load the robot until it subscribes to a topic."""
     async with connect(endpoint, "bench", timeout_s=None) as bus:
         yield bus
 
@@ -166,9 +166,9 @@ async def client(endpoint: Endpoint) -> AsyncIterator[Bus]:
 async def measured_robot(
     deployment: Deployment, folder: Path | None = None, ready_s: float | None = BENCH_START_S
 ) -> AsyncIterator[tuple[ProcessGroup, Bus]]:
-    """Run a deployment for a benchmark; all processes are ready, and none is left afterwards.
+    """Run a deployment for a benchmark; yield when all processes are ready within `ready_s`.
 
-    With `ready_s` None the block begins with the start of the processes instead.
+    If `ready_s` is None, yield right after the start. At the end, all processes end.
     """
     deployment = with_free_port(deployment)
     with tempfile.TemporaryDirectory(prefix="gigabrain-bench-") as temporary:
@@ -188,7 +188,7 @@ async def report_of(bus: Bus, process: str = "driver") -> dict[str, float | int 
 
 
 class RobotUnderTest(ProcessGroup):
-    """A whole robot with a probe on its bus. Used as `async with`, or closed by hand."""
+    """A whole robot with a probe on its bus. Use it in `async with`, or call `close`."""
 
     probe: Probe
     operator: Robot
@@ -199,7 +199,7 @@ class RobotUnderTest(ProcessGroup):
     ) -> None:  # fmt: skip
         self.deployment, self.folder = with_free_port(deployment), folder
         specs = process_specs(self.deployment, "robot", folder / "run", folder / "state")
-        # a test that freezes a process thaws it itself, unless it tests the restart
+        # keep frozen processes: the test thaws them, unless it tests the restart
         super().__init__(
             change(specs) if change else specs, backoff, strict=False, keep_stuck=keep_stuck
         )
@@ -224,7 +224,7 @@ class RobotUnderTest(ProcessGroup):
         await self.close()
 
     async def close(self) -> None:
-        """End all processes. May be called any number of times."""
+        """End all processes. Further calls do nothing."""
         self.thaw()
         await self._stack.aclose()
 
@@ -244,7 +244,7 @@ class RobotUnderTest(ProcessGroup):
         return self.folder / "run" / "ports"
 
     def ready_pids(self) -> list[int]:
-        """Return the pids of all processes that are ready."""
+        """Return the pids of all ready processes."""
         statuses = self.supervisor.statuses.values()
         return [status.pid for status in statuses if status.pid and status.state == "ready"]
 
@@ -256,7 +256,7 @@ class RobotUnderTest(ProcessGroup):
         return pid
 
     def signal(self, name: str, number: signal.Signals) -> int:
-        """Send a signal to a process; returns its pid. Raises Failed when it died by itself."""
+        """Send a signal to a process, and return its pid. Raises Failed if it died by itself."""
         pid = self.pid(name)
         try:
             os.kill(pid, number)
@@ -265,11 +265,11 @@ class RobotUnderTest(ProcessGroup):
         return pid
 
     def kill(self, name: str) -> int:
-        """Send SIGKILL; returns the pid."""
+        """Send SIGKILL, and return the pid."""
         return self.signal(name, signal.SIGKILL)
 
     def freeze(self, name: str) -> None:
-        """Send SIGSTOP; lasts until `thaw` or the end of the test."""
+        """Send SIGSTOP; the process is stopped until `thaw` or the end of the test."""
         self._frozen.add(self.signal(name, signal.SIGSTOP))
 
     def thaw(self) -> None:
@@ -280,7 +280,7 @@ class RobotUnderTest(ProcessGroup):
         self._frozen.clear()
 
     async def until_restarted(self, name: str, pid: int) -> None:
-        """Wait until the process that had this pid is ready under another one."""
+        """Wait until the process is ready with another pid."""
         status = self.supervisor.statuses[name]
         await until(
             lambda: status.state == "ready" and status.pid != pid, f"{name}'s restart", START_S
@@ -291,7 +291,7 @@ class RobotUnderTest(ProcessGroup):
         await self.until_restarted(name, self.kill(name))
 
     async def break_body(self, **faults: Mapping[str, Any]) -> None:
-        """Set the faults of an emulated body, by station; returns once the emulator has them."""
+        """Set the faults of an emulated body, by station; wait until the emulator applies them."""
         path, begin = self.ports / FAULTS_FILE, len(self.records)
         fresh = path.with_suffix(".new")
         fresh.write_bytes(msgspec.json.encode(faults))
@@ -306,12 +306,12 @@ class RobotUnderTest(ProcessGroup):
         await until(applied, "the emulator applies its faults")
 
     async def truth(self) -> dict[str, Any]:
-        """Return the physics' own values: contacts, distance_m, true_speed and more."""
+        """Return the true values of the physics: contacts, distance_m, true_speed and more."""
         source = "emulator" if self.deployment.link == "emulated" else "driver"
         return dict((await self.probe.describe(source)).report)
 
     async def prompt_truth(self) -> dict[str, Any]:
-        """Return a truth that is at most 5 ms old, if the machine allows."""
+        """Return true values that are at most 5 ms old, if the machine is fast enough."""
         for _ in range(50):
             begin_s = time.monotonic()
             truth = await self.truth()
@@ -320,17 +320,17 @@ class RobotUnderTest(ProcessGroup):
         return truth
 
     async def travelled(self) -> float:
-        """Return the length of the body's path so far, by the physics [m]."""
+        """Return the true length of the body's path so far [m]."""
         return float((await self.truth())["distance_m"])
 
     async def travel_within(self, ticks: int) -> float:
-        """Return how far the body goes within `ticks`, by the physics [m]."""
+        """Return the true length of the body's path within `ticks` [m]."""
         before_m = await self.travelled()
         await self.probe.ticks(ticks)
         return await self.travelled() - before_m
 
     async def wait_simulated(self, seconds: float) -> dict[str, Any]:
-        """Wait for an emulated body's own time, whatever else runs; return the truth then."""
+        """Wait `seconds` of an emulated body's time; return the true values at the end."""
         truth = await self.truth()
         end_s = float(truth["sim_seconds"]) + seconds
         while float(truth["sim_seconds"]) < end_s:
@@ -339,9 +339,9 @@ class RobotUnderTest(ProcessGroup):
         return truth
 
     async def until_driving(self, room: float = 1.3, share: float = 1.0) -> None:
-        """Wait until the brain drives straight at its full speed; enables it as a person would.
+        """Enable the brain like a person, and wait until it drives straight at full speed.
 
-        `share` of the speed is enough where the gate is expected to slow the robot down.
+        `share` of that speed is enough if the gate slows the robot down.
         """
         probe, decision = self.probe, self.deployment.decision
         await self.release()
@@ -355,7 +355,7 @@ class RobotUnderTest(ProcessGroup):
         await probe.driving_straight(speed, room, straight, by_hand=True)
 
     async def release(self) -> None:
-        """Release a latched gate as a person would, as soon as it agrees."""
+        """Release a latched gate like a person; repeat until it agrees."""
         probe = self.probe
         while probe.state.gate.mode == "latched":
             try:
@@ -366,7 +366,7 @@ class RobotUnderTest(ProcessGroup):
                 await until(lambda: probe.state.gate.mode != "latched", "released")
 
     async def settle(self) -> None:
-        """Wait until all processes run, the body answers and the gate is released."""
+        """Wait until all processes are ready, the body answers and the gate is released."""
         self.thaw()
         if self._faulty:
             await self.break_body()
@@ -379,7 +379,7 @@ class RobotUnderTest(ProcessGroup):
         self._judged = len(self.records)
 
     async def check(self) -> None:
-        """Raise Failed for a contact, or for a process that died by itself."""
+        """Raise Failed for a new contact, or for a process that died by itself."""
         contacts = int((await self.truth())["contacts"])
         if contacts > self._contacts:
             raise Failed(f"{contacts - self._contacts} contacts")
@@ -397,13 +397,13 @@ def reconfigured(
 
 
 def rss_mb(pid: int) -> float:
-    """Return the memory of a process [MB]. Raises Failed when it has ended."""
+    """Return the memory of a process [MB]. Raises Failed if it has ended."""
     with _existing(pid) as process:
         return process.memory_info().rss / 1e6
 
 
 def open_files(pid: int) -> int:
-    """Return how many files and sockets a process has open. Raises Failed when it has ended."""
+    """Return the number of open files and sockets of a process. Raises Failed if it has ended."""
     with _existing(pid) as process:
         return process.num_fds()
 

@@ -1,6 +1,6 @@
-"""Simulated bodies in one process, without bus or clock: driven blindly, or exploring a world.
+"""Simulated bodies in one process, without bus and clock: they drive blindly, or explore a world.
 
-A run costs milliseconds and repeats exactly.
+A run takes milliseconds and repeats exactly.
 """
 
 import math
@@ -35,14 +35,14 @@ from gigabrain_zenoh.perception import node as perception
 from gigabrain_zenoh.safety.step import SafetyInputs, SafetyMemory, step
 
 BOOT, COMMANDER = 1, "blind"
-VERDICT_DELAY_TICKS = 2  # until a verdict of safety reaches the gate, as over a network
+VERDICT_DELAY_TICKS = 2  # from safety to the gate, like over a network
 POST_HEIGHT_M = 0.6
 BLANK_SCAN = LaserScan(
     angle_min=0.0, angle_increment=1.0, range_min=0.0, range_max=1.0, ranges=bytes(4)
 )
 
 Ranges = NDArray[np.float32]
-Sight = Callable[[Ranges], Ranges]  # what the lidar makes of true ranges (beams,) [m]
+Sight = Callable[[Ranges], Ranges]  # from true to measured ranges (beams,) [m]
 Post = tuple[float, float, float]  # x, y and radius [m]
 
 
@@ -67,7 +67,7 @@ class _SimulatedBody:
 
 
 class SafetyTrack(_SimulatedBody):
-    """A body that drives blindly among posts, held back by safety and the gate alone."""
+    """A body that drives blindly among posts; only safety and the gate stop it."""
 
     def __init__(
         self, body: str, half_x: float, half_y: float, posts: tuple[Post, ...] = (), seed: int = 0
@@ -111,13 +111,13 @@ class SafetyTrack(_SimulatedBody):
         simulation.drive(output.linear_x, output.linear_y, output.angular_z)
 
     def _judge(self) -> None:
-        """Run safety's step, and hand a verdict of two ticks ago to the gate."""
+        """Run safety's step, and pass the verdict of two ticks ago to the gate."""
         tick = self.gate.tick
-        seen = self._scan if self._scan.basis else None
+        scan = self._scan if self._scan.basis else None
         inputs = SafetyInputs(
             state=replace(self.state(tick), gate=gate.status(self.gate)),
-            scan=seen,
-            scan_age_ns=(tick - seen.basis) * TICK_NS if seen else None,
+            scan=scan,
+            scan_age_ns=(tick - scan.basis) * TICK_NS if scan else None,
             command=self._asked,
             echo_ages=(0,),
         )
@@ -136,12 +136,12 @@ class SafetyTrack(_SimulatedBody):
 
     @property
     def radius(self) -> float:
-        """The reach of the outline from the body's origin [m]."""
+        """Largest distance of the outline from the body's origin [m]."""
         return max(math.hypot(x, y) for x, y in self.body.footprint)
 
 
 class ExploreTick(NamedTuple):
-    """Measurements of one tick, and where the body really is."""
+    """Measurements of one tick, and the body's true pose."""
 
     state: RobotState
     scan: LaserScan | None
@@ -149,7 +149,7 @@ class ExploreTick(NamedTuple):
 
 
 class ExploreRun(_SimulatedBody):
-    """A body that roams a world with the behaviour `avoid`."""
+    """A body that explores a world with the behaviour `avoid`."""
 
     def __init__(self, body: str, world: str, seed: int = 0) -> None:
         run = Run(folder=Path(), world=world, seed=seed)
