@@ -1,4 +1,4 @@
-"""Faults of a link: their words, and their effect on its bytes."""
+"""Faults of a link: their commands, and their effect on the link's bytes."""
 
 import math
 import random
@@ -21,14 +21,14 @@ class Chaos(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Faults of one direction of a link. A piece is the bytes of one read."""
 
     hole: bool = False  # nothing is read from the sender; its bytes arrive when this ends
-    delay_ms: NonNegative = 0.0  # added to every piece
-    jitter_ms: NonNegative = 0.0  # at most added to the delay; pieces keep their order
-    loss: Chance = 0.0  # of each piece to arrive 200 ms late, as TCP resends it
-    bytes_s: NonNegative = 0.0  # [bytes/s] at most; 0 for no limit
-    corrupt: Chance = 0.0  # of each byte to arrive with one bit flipped
-    drop: Chance = 0.0  # of each piece to vanish
-    garbage: Chance = 0.0  # of each piece to be preceded by random bytes
-    split: Chance = 0.0  # of each piece to come in two halves, 2 ms apart
+    delay_ms: NonNegative = 0.0  # of each piece
+    jitter_ms: NonNegative = 0.0  # largest random addition to the delay; pieces keep their order
+    loss: Chance = 0.0  # per piece: it arrives 200 ms late, as TCP resends it
+    bytes_s: NonNegative = 0.0  # limit [bytes/s]; 0 for none
+    corrupt: Chance = 0.0  # per byte: one of its bits is flipped
+    drop: Chance = 0.0  # per piece: it is lost
+    garbage: Chance = 0.0  # per piece: random bytes precede it
+    split: Chance = 0.0  # per piece: it arrives in two halves, 2 ms apart
     merge_ms: NonNegative = 0.0  # pieces within this time are forwarded as one
 
 
@@ -36,7 +36,7 @@ CALM = Chaos()
 
 
 class ProxyCommand(Struct, frozen=True, kw_only=True):
-    """A typed line, parsed."""
+    """A parsed command line."""
 
     ways: tuple[Way, ...] = ()
     chaos: Chaos = CALM
@@ -76,15 +76,15 @@ def parse_struct(words: list[str], kind: type[S], others: tuple[str, ...] = ()) 
         raise ConfigError(f"{' '.join(words)!r}: {error}") from None
 
 
-LONGEST_GARBAGE = 64  # bytes
-RESENT_S = 0.2  # least time after which Linux resends a lost segment
+MAX_GARBAGE_BYTES = 64
+RESEND_S = 0.2  # least time until Linux resends a lost segment
 HALVES_S = 0.002  # between the halves of a piece
-MAX_INTACT = 1e15  # bytes
-THROTTLED_PIECE_S = 0.02  # length of a piece on a throttled line
+MAX_INTACT_BYTES = 1e15
+THROTTLED_PIECE_S = 0.02  # duration of a piece on a throttled line
 
 
 class WayCounters(Struct, kw_only=True):
-    """Counters of one direction of a link, since the proxy was made."""
+    """Counters of one direction of a link, since the start of the proxy."""
 
     taken: int = 0  # bytes from the sender
     handed_on: int = 0  # bytes to the receiver, with damage and garbage
@@ -92,7 +92,7 @@ class WayCounters(Struct, kw_only=True):
     flipped: int = 0  # bits
     dropped: int = 0  # bytes
     garbage: int = 0  # bytes
-    late: int = 0  # pieces that were lost and resent
+    late: int = 0  # resent pieces
 
 
 class LinkDamage:
@@ -100,26 +100,26 @@ class LinkDamage:
 
     def __init__(self, chance: random.Random, figures: WayCounters) -> None:
         self._chance, self.figures = chance, figures
-        self._newest_s = 0.0  # when the last piece arrives; later ones keep the order
-        self._free_s = 0.0  # when a throttled line is free
-        self._rate = 0.0  # chance of a flipped bit with which `_clean` was drawn
+        self._newest_s = 0.0  # arrival time of the newest piece; later ones keep the order
+        self._free_s = 0.0  # time at which a throttled line is free
+        self._rate = 0.0  # chance of a flipped bit for which `_clean` was drawn
         self._clean = 0  # bytes until the next flipped bit
 
     def damaged(self, data: bytes, chaos: Chaos, now_s: float) -> list[tuple[float, bytes]]:
-        """Return `data`, received at `now_s`, as (arrival time [s], piece)."""
+        """Return the damaged pieces of `data` from time `now_s`: (arrival time [s], piece)."""
         self.figures.taken += len(data)
         if self._happens(chaos.drop):
             self.figures.dropped += len(data)
             return []
         if self._happens(chaos.garbage):
-            noise = self._chance.randbytes(self._chance.randint(1, LONGEST_GARBAGE))
+            noise = self._chance.randbytes(self._chance.randint(1, MAX_GARBAGE_BYTES))
             self.figures.garbage += len(noise)
             data = noise + data
         data = self._flipped(data, chaos.corrupt)
         arrival_s = now_s + (chaos.delay_ms + self._chance.random() * chaos.jitter_ms) / 1e3
         if self._happens(chaos.loss):
             self.figures.late += 1
-            arrival_s += RESENT_S
+            arrival_s += RESEND_S
         half = len(data) // 2
         if half and self._happens(chaos.split):
             return [
@@ -129,7 +129,7 @@ class LinkDamage:
         return self._sent(data, chaos, arrival_s)
 
     def _sent(self, data: bytes, chaos: Chaos, arrival_s: float) -> list[tuple[float, bytes]]:
-        """Split and delay by the line's rate and merging; pieces keep their order."""
+        """Split and delay `data` by the line's rate and by merging; pieces keep their order."""
         size = max(1, int(chaos.bytes_s * THROTTLED_PIECE_S)) if chaos.bytes_s else len(data)
         pieces = []
         for start in range(0, len(data), size):
@@ -147,23 +147,23 @@ class LinkDamage:
 
     def _flipped(self, data: bytes, rate: float) -> bytes:
         if rate != self._rate:
-            self._rate, self._clean = rate, self._drawn(rate)
+            self._rate, self._clean = rate, self._draw_intact(rate)
         if not rate:
             return data
         noisy = bytearray(data)
         while self._clean < len(noisy):
             noisy[self._clean] ^= 1 << self._chance.randrange(8)
             self.figures.flipped += 1
-            self._clean += 1 + self._drawn(rate)
+            self._clean += 1 + self._draw_intact(rate)
         self._clean -= len(noisy)
         return bytes(noisy)
 
-    def _drawn(self, rate: float) -> int:
+    def _draw_intact(self, rate: float) -> int:
         """Return the number of intact bytes before the next damaged one."""
         if rate in (0.0, 1.0):
             return 0
-        least = 1.0 - self._chance.random()  # in (0, 1]
-        return int(min(MAX_INTACT, math.log(least) / math.log1p(-rate)))
+        sample = 1.0 - self._chance.random()  # in (0, 1]
+        return int(min(MAX_INTACT_BYTES, math.log(sample) / math.log1p(-rate)))
 
     def _happens(self, chance: float) -> bool:
         return chance > 0 and self._chance.random() < chance

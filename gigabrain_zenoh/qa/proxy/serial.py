@@ -1,4 +1,4 @@
-"""Proxies between a driver and its body: a wire that loses, flips, splits and merges bytes."""
+"""Proxies between a driver and its body: they lose, damage, split and merge bytes."""
 
 import contextlib
 import os
@@ -19,9 +19,9 @@ ANY_BAUD = 115200  # a pty takes any
 
 
 class LineProxy:
-    """A pty at `path` that leads to the serial port `to`. Used as `async with`.
+    """A pty at `path` that is connected to the serial port `to`. Use it in `async with`.
 
-    A wire keeps nothing: bytes into a hole are lost, and so are bytes that do not fit.
+    A wire has no buffer: during a `hole`, and when the receiver is full, bytes are lost.
     """
 
     def __init__(self, to: str, path: Path, *, baud: int = ANY_BAUD, seed: int = 0) -> None:
@@ -37,7 +37,7 @@ class LineProxy:
 
     @property
     def connected(self) -> bool:
-        """True while the port behind is open."""
+        """True while the real port is open."""
         return self._link.connected
 
     async def __aenter__(self) -> Self:
@@ -75,7 +75,7 @@ class LineProxy:
 
 
 class _Wire:
-    """One direction: a Pipe whose sender cannot be made to wait."""
+    """One direction: a Pipe whose sender does not wait."""
 
     def __init__(self, damage: LinkDamage, write: Callable[[bytes], object]) -> None:
         self._figures, self._room = damage.figures, True
@@ -96,23 +96,23 @@ class _Wire:
 async def in_front_of(
     ports: Path, folder: Path, *, seed: int = 0
 ) -> AsyncIterator[dict[str, LineProxy | TcpProxy]]:
-    """Run a proxy in `folder` for each of an emulator's `ports`; yields them by name.
+    """Run a proxy in `folder` for each of an emulator's `ports`; yield them by name.
 
-    The driver then takes its ports from `folder` (`--ports`). Raises ConfigError.
+    The driver uses the ports in `folder` (`--ports`). Raises ConfigError.
     """
     proxies = _proxies(ports, folder, seed)
     async with contextlib.AsyncExitStack() as stack:
         for name, proxy in proxies.items():
             await stack.enter_async_context(proxy)
             if isinstance(proxy, TcpProxy):
-                note = folder / name
-                _write(note, f"{proxy}\n")
-                stack.callback(note.unlink)
+                address_file = folder / name
+                _write(address_file, f"{proxy}\n")
+                stack.callback(address_file.unlink)
         yield proxies
 
 
 def _proxies(ports: Path, folder: Path, seed: int) -> dict[str, LineProxy | TcpProxy]:
-    """Return a proxy per port: a link leads to a pty, a file names a TCP address."""
+    """Return a proxy per port: a symbolic link points to a pty, a file has a TCP address."""
     folder.mkdir(parents=True, exist_ok=True)
     found: dict[str, LineProxy | TcpProxy] = {}
     for port in sorted(ports.iterdir()):

@@ -16,7 +16,7 @@ Address = tuple[str, int]
 
 RESET = struct.pack("ii", 1, 0)  # linger for 0 s: closing resets the connection
 BACKLOG = 128
-MAX_WAITING_BYTES = 4 << 20  # bytes under way; then the sender waits
+MAX_WAITING_BYTES = 4 << 20  # in a pipe; then the sender waits
 
 
 class Pipe:
@@ -41,7 +41,7 @@ class Pipe:
         self._timer: asyncio.TimerHandle | None = None
 
     def set(self, chaos: Chaos) -> None:
-        """Replace the faults; pieces under way keep their arrival times."""
+        """Replace the faults; pieces in the pipe keep their arrival times."""
         self._chaos = chaos
         self.flush()
 
@@ -54,17 +54,17 @@ class Pipe:
         self.flush()
 
     def end(self) -> None:
-        """End the stream: `on_end` is called once the last byte has arrived."""
+        """End the stream: `on_end` is called after the last byte."""
         self._ended = True
         self.flush()
 
     def stick(self, stuck: bool) -> None:
-        """Set whether the receiver accepts no bytes at present."""
+        """Set whether the receiver is full."""
         self._stuck = stuck
         self.flush()
 
     def close(self) -> None:
-        """Drop the pieces under way."""
+        """Drop the pieces in the pipe."""
         if self._timer:
             self._timer.cancel()
         self._queue.clear()
@@ -102,7 +102,7 @@ class Pipe:
 
 
 class ProxiedCall:
-    """Two sockets with a pipe each way; calls `on_gone` when both are closed."""
+    """Two sockets with a pipe in each direction; calls `on_gone` when both are closed."""
 
     def __init__(
         self,
@@ -120,13 +120,13 @@ class ProxiedCall:
 
     def set(self, chaos: Mapping[Way, Chaos]) -> None:
         """Replace the faults, by direction."""
-        self._through = not any(its.hole for its in chaos.values())
+        self._through = not any(one.hole for one in chaos.values())
         for end, way in zip((self.caller, self.called), WAYS, strict=True):
             end.out.set(chaos[way])
         self.begin()
 
     def begin(self) -> None:
-        """Connect to the target once the caller is connected and there is no hole."""
+        """Connect to the target if the caller is connected and there is no hole."""
         if self._through and self.caller.transport and not self._calling and not self._over:
             self._calling = asyncio.create_task(self._call())
 
@@ -174,7 +174,7 @@ class End(asyncio.Protocol):
         self.out = Pipe(damage, other.write, self.room, other.end)
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        """Start; called by asyncio, as are the next five."""
+        """Start. Asyncio calls this method and the next five."""
         self.transport = cast(asyncio.Transport, transport)
         self.transport.pause_reading()
         self.out.flush()
@@ -186,21 +186,21 @@ class End(asyncio.Protocol):
         self.out.feed(data)
 
     def eof_received(self) -> bool:
-        """Note that the peer sends no more; it may still receive."""
+        """End this direction: the peer sends no more, but may still receive."""
         self._received_all = True
         self.out.end()
         return not self._sent_all
 
     def pause_writing(self) -> None:
-        """Note that the peer does not read."""
+        """Stop the other pipe: the peer does not read."""
         self._other.out.stick(True)
 
     def resume_writing(self) -> None:
-        """Note that the peer reads again."""
+        """Continue the other pipe: the peer reads again."""
         self._other.out.stick(False)
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """Note that the socket is closed: reset, or ended by both."""
+        """Close the other socket if this one was reset; release both if both are closed."""
         self.transport = None
         if exc or not self._sent_all:
             self._call.cut(reset=True)
@@ -233,7 +233,7 @@ class End(asyncio.Protocol):
         if self.transport is None or self.transport.is_closing():
             return
         sock: socket.socket = self.transport.get_extra_info("socket")
-        with contextlib.suppress(OSError):  # it has just been closed by its peer
+        with contextlib.suppress(OSError):  # the peer has closed it
             if reset:
                 sock.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, RESET)
             else:
@@ -242,10 +242,10 @@ class End(asyncio.Protocol):
 
 
 class TcpProxy:
-    """Listens at `listen` and connects each caller to `target`. Used as `async with`.
+    """Listens at `listen` and connects each caller to `target`. Use it in `async with`.
 
-    `set` sets the faults, `cut` closes connections. A hole leaves the bytes in the sender's kernel,
-    as a dead network does, and forwards them when it ends. New callers are accepted meanwhile.
+    `set` sets the faults, `cut` closes connections. During a hole, bytes stay in the sender's
+    kernel, as in a dead network; after it, they are forwarded. New callers are still accepted.
     """
 
     def __init__(
@@ -263,7 +263,7 @@ class TcpProxy:
 
     @property
     def address(self) -> Address:
-        """(host, port) at which it listens, also while it is unplugged."""
+        """(host, port) of the listener, also while it is unplugged."""
         return self._listen
 
     @property
@@ -292,7 +292,7 @@ class TcpProxy:
             call.set(self.chaos)
 
     def cut(self, *, reset: bool = False) -> None:
-        """Close all connections, with FIN or with RST; bytes under way are lost."""
+        """Close all connections, with FIN or with RST; bytes in the pipes are lost."""
         self.cuts += len(self._open)
         for call in list(self._open):
             call.cut(reset)
@@ -320,7 +320,7 @@ class TcpProxy:
             await call.ended()
 
     def _accept(self) -> asyncio.Protocol:
-        """Accept a caller. Each has its own random numbers, so that their order does not matter."""
+        """Accept a caller. Each has its own random numbers, independent of the order of bytes."""
         self.calls += 1
         chances = (random.Random(f"{self._seed} {self.calls} {way}") for way in WAYS)
         damages = [LinkDamage(c, f) for c, f in zip(chances, self.figures.values(), strict=True)]

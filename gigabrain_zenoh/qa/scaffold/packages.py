@@ -1,4 +1,4 @@
-"""The package of a new process, perceptor or behaviour: it runs, and its test passes, as it is."""
+"""Writes the package of a new process, perceptor or behaviour; it runs, and its test passes."""
 
 import keyword
 import re
@@ -18,7 +18,7 @@ from gigabrain_zenoh.security.acl import check_write
 
 Kind = Literal["process", "perceptor", "behaviour"]
 PACKAGE_NAME = re.compile(r"[a-z][a-z0-9_]{0,30}[a-z0-9]")
-GROUPS: Mapping[Kind, tuple[str, str]] = {  # entry points, and what one names
+GROUPS: Mapping[Kind, tuple[str, str]] = {  # group of entry points, and the object that one names
     "process": ("gigabrain.processes", "row:ROW"),
     "perceptor": ("gigabrain.perceptors", "perceptor:${camel}"),
     "behaviour": ("gigabrain.behaviours", "behaviour:${camel}"),
@@ -81,17 +81,17 @@ def write_package(kind: Kind, name: str, folder: Path) -> Path:
 
 
 def _taken_names(kind: Kind) -> Collection[str]:
-    """Return the names under which a package of this kind would not be found."""
+    """Return the names that other packages of this kind, or settings, already use."""
     if kind == "behaviour":
         return behaviours.names()
     processes = plugin_names(PROCESSES, GROUP)
-    if kind == "perceptor":  # it runs in a process of its name
+    if kind == "perceptor":  # it runs in a process with its name
         return [*processes, *plugin_names(perceptors.SHIPPED, perceptors.GROUP)]
-    return [*processes, *Deployment.__struct_fields__]  # its settings are a part of that file
+    return [*processes, *Deployment.__struct_fields__]  # its settings are a field of that file
 
 
 def _may_write(name: str) -> bool:
-    """Return whether the keys below `robot/NAME` are free, as no topic or service is there."""
+    """Return whether the keys below `robot/NAME` are free of topics and services."""
     try:
         check_write(f"robot/{name}/**")
     except ValueError:

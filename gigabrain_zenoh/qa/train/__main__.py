@@ -1,6 +1,6 @@
 """Commands of the training program: `python -m gigabrain_zenoh.qa.train COMMAND`.
 
-all: render, learn, export, score: what made the shipped net. `sheet` shows hits and misses.
+`all` renders, learns, exports and scores, as for the shipped net. `sheet` shows hits and misses.
 """
 
 import logging
@@ -89,9 +89,9 @@ def sheet(
     if worst:
         pairs.sort(key=lambda pair: -sheets.mistakes(*pair))
     else:
-        pairs = pairs[:: max(1, len(pairs) // count)]  # of many studios
-    made = sheets.sheet(*zip(*pairs[:count], strict=True))
-    cv2.imwrite(str(path), made[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 85])
+        pairs = pairs[:: max(1, len(pairs) // count)]  # from many studios
+    picture = sheets.sheet(*zip(*pairs[:count], strict=True))
+    cv2.imwrite(str(path), picture[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 85])
 
 
 @app.command(name="all")

@@ -24,7 +24,7 @@ def frustum(
 
 
 def board(rng: Random) -> Look:
-    """A thin board on edge with three to five slanted sides: no rectangle, as a box would show."""
+    """A thin board on edge with three to five slanted sides: not a rectangle like a box's face."""
     w, h, thin = rng.uniform(0.06, 0.2), rng.uniform(0.1, 0.5), rng.uniform(0.005, 0.02)
     tops = [(rng.uniform(-0.7, 0.7), 1.0)]
     tops += [(side * rng.uniform(0.6, 1.2), rng.uniform(0.3, 0.8)) for side in (-1, 1)]
@@ -51,7 +51,7 @@ def cone(rng: Random) -> Look:
 
 
 def wedge(rng: Random) -> Look:
-    """A prism, seen from its triangular end: from its side it would be a box."""
+    """A prism, seen from its triangular end: from its side it looks like a box."""
     x, y, z = rng.uniform(0.08, 0.3), rng.uniform(0.08, 0.3), rng.uniform(0.06, 0.3)
     ridge = rng.uniform(-y, y)
     points = [(sx * x, sy * y, 0.0) for sx in (-1, 1) for sy in (-1, 1)]
@@ -60,14 +60,14 @@ def wedge(rng: Random) -> Look:
 
 
 def egg(rng: Random) -> Look:
-    """An ellipsoid, upright or flat, so that it is no ball from any side."""
+    """An ellipsoid, upright or flat enough not to look like a ball from any side."""
     r, ratio = rng.uniform(0.03, 0.1), rng.uniform(1.7, 3.0)
     size = (r * ratio, r * ratio, r) if rng.random() < 0.4 else (r, r, r * ratio)
     return Look("", (Geom("ellipsoid", size, (0, 0, size[2])),), max(size), 2 * size[2])
 
 
 def sausage(rng: Random) -> Look:
-    """A capsule on the floor, seen from its side: from its end it would be a ball."""
+    """A capsule on the floor, seen from its side: from its end it looks like a ball."""
     r, half = rng.uniform(0.03, 0.08), rng.uniform(0.1, 0.3)
     parts = (Geom("capsule", (r, half), (0, 0, r), ALONG_Y),)
     return Look("", parts, half + r, 2 * r, facing=0.7)

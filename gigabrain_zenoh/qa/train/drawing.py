@@ -1,4 +1,4 @@
-"""Off-screen pictures of a model: colours, or the geom that is seen in each pixel."""
+"""Off-screen pictures of a model: colours, or the visible geom of each pixel."""
 
 import mujoco
 import numpy as np
@@ -11,9 +11,9 @@ NOTHING = -1
 
 
 class Drawing:
-    """Draws by EGL or OSMesa. Raises ConfigError naming the packages that are missing.
+    """Draws with EGL or OSMesa. Raises ConfigError with the names of missing packages.
 
-    It is for one thread. Close it after use.
+    Use it in one thread, and close it after use.
     """
 
     def __init__(self, model: mujoco.MjModel, camera: int, width: int, height: int) -> None:
@@ -26,7 +26,7 @@ class Drawing:
         self._camera.type, self._camera.fixedcamid = mujoco.mjtCamera.mjCAMERA_FIXED, camera
 
     def close(self) -> None:
-        """Free what OpenGL holds."""
+        """Free OpenGL's memory."""
         self._context.free()
         self._graphics.free()
 
@@ -36,13 +36,13 @@ class Drawing:
         return self._pixels()
 
     def geoms(self, data: mujoco.MjData, options: mujoco.MjvOption) -> NDArray[np.int64]:
-        """Return the number of the geom in each pixel (h, w); NOTHING where there is none."""
+        """Return the number of the visible geom for each pixel (h, w); NOTHING if there is none."""
         self._update(data, options)
         flags = self._scene.flags
         flags[mujoco.mjtRndFlag.mjRND_SEGMENT] = flags[mujoco.mjtRndFlag.mjRND_IDCOLOR] = True
         colours = self._pixels().astype(np.int64)
         flags[mujoco.mjtRndFlag.mjRND_SEGMENT] = flags[mujoco.mjtRndFlag.mjRND_IDCOLOR] = False
-        numbers = np.full(self._scene.ngeom + 1, NOTHING)  # by the colour; 0 is nothing
+        numbers = np.full(self._scene.ngeom + 1, NOTHING)  # by colour; 0 is the background
         for geom in self._scene.geoms[: self._scene.ngeom]:
             if geom.objtype == GEOM:
                 numbers[geom.segid + 1] = geom.objid
@@ -53,14 +53,17 @@ class Drawing:
         mujoco.mjv_updateScene(
             self._model, data, options, None, self._camera, everything, self._scene
         )
-        # the context keeps a copy of which textures materials have, from when it was made
+        # the context has its own copy of the materials' textures
         for name in ("mat_texid", "mat_texrepeat"):
-            now = getattr(self._model, name).ravel()
-            getattr(self._context, name)[: now.size] = now
+            values = getattr(self._model, name).ravel()
+            getattr(self._context, name)[: values.size] = values
 
     def _pixels(self) -> NDArray[np.uint8]:
         height, width = self._size
-        pixels, whole = np.empty((height, width, 3), np.uint8), mujoco.MjrRect(0, 0, width, height)
-        mujoco.mjr_render(whole, self._scene, self._context)
-        mujoco.mjr_readPixels(pixels, None, whole, self._context)
-        return np.ascontiguousarray(pixels[::-1])  # OpenGL counts rows from below
+        pixels, viewport = (
+            np.empty((height, width, 3), np.uint8),
+            mujoco.MjrRect(0, 0, width, height),
+        )
+        mujoco.mjr_render(viewport, self._scene, self._context)
+        mujoco.mjr_readPixels(pixels, None, viewport, self._context)
+        return np.ascontiguousarray(pixels[::-1])  # OpenGL's first row is the lowest

@@ -1,4 +1,4 @@
-"""Writes a trained net as ONNX, normalisation folded into weights."""
+"""Writes a trained net as ONNX, with the normalisation folded into its weights."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -15,7 +15,7 @@ OPSET, IR_VERSION = 13, 8
 
 
 class OnnxOps:
-    """The net as nodes of a graph; a tensor is its name."""
+    """The net's operations as nodes of an ONNX graph; a tensor is its name."""
 
     def __init__(self, folded: Mapping[str, tuple[Any, Any]]) -> None:
         self._folded = folded
@@ -59,15 +59,15 @@ class OnnxOps:
         )
 
     def relu(self, x: str) -> str:
-        """Cut below zero."""
+        """Apply ReLU."""
         return self._node("Relu", [x])
 
     def add(self, a: str, b: str) -> str:
-        """Add."""
+        """Add two tensors."""
         return self._node("Add", [a, b])
 
     def double(self, x: str) -> str:
-        """Repeat cells."""
+        """Repeat each cell twice in both directions."""
         modes = {
             "mode": "nearest",
             "nearest_mode": "floor",
@@ -77,7 +77,7 @@ class OnnxOps:
 
 
 def model(params: net.Params, moments: net.Params) -> onnx.ModelProto:
-    """Return the net for one picture (1, 3, 240, 320), 0 to 1, with a fixed shape."""
+    """Return the net for one picture of fixed shape (1, 3, 240, 320), from 0 to 1."""
     ops = OnnxOps(net.fold(params, moments))
     last = net.network(ops, "picture")
     shape = [1, net.OUTPUTS, HEIGHT_PX // STRIDE_PX, WIDTH_PX // STRIDE_PX]
@@ -90,10 +90,10 @@ def model(params: net.Params, moments: net.Params) -> onnx.ModelProto:
         [helper.make_tensor_value_info("cells", TensorProto.FLOAT, shape)],
         ops.numbers,
     )
-    made = helper.make_model(graph, opset_imports=[helper.make_opsetid("", OPSET)])
-    made.ir_version = IR_VERSION
-    onnx.checker.check_model(made, full_check=True)
-    return made
+    exported = helper.make_model(graph, opset_imports=[helper.make_opsetid("", OPSET)])
+    exported.ir_version = IR_VERSION
+    onnx.checker.check_model(exported, full_check=True)
+    return exported
 
 
 def export(params: net.Params, moments: net.Params, path: Path) -> None:

@@ -26,15 +26,15 @@ from gigabrain_zenoh.vision.recognizer import (
 
 
 class Stage(NamedTuple):
-    """A part of training: it ends after this share of steps."""
+    """A part of training with pictures of one size."""
 
-    end: float
+    end: float  # share of all steps at its end
     width: int  # of pictures [px], a multiple of 16
     height: int  # a multiple of 16
     batch: int
 
 
-# Small pictures cost less: first learn what things look like.
+# Small pictures take less time, and suffice to learn the looks first.
 STAGES = (
     Stage(0.4, 192, 144, 24),
     Stage(0.75, 256, 192, 16),
@@ -42,7 +42,7 @@ STAGES = (
 )
 PEAK_RATE, WEIGHT_DECAY, WARM_UP_STEPS = 2.5e-3, 2e-2, 200
 BOX_WEIGHT = 4.0
-AVERAGED = 0.998  # of the weights that are exported, a step
+AVERAGE_DECAY = 0.998  # per step, of the averaged weights, which are exported
 LOG_EVERY_STEPS, SAVE_EVERY_STEPS = 100, 500
 log = logging.getLogger(__name__)
 
@@ -51,9 +51,9 @@ Batch = tuple[Any, ...]
 
 
 def heat_loss(logits: Any, heat: Any, mask: Any) -> Any:
-    """Penalty-reduced focal loss of CenterNet, for one thing in the mean."""
+    """Penalty-reduced focal loss of CenterNet, as the mean over things."""
     p, peak = tf.sigmoid(logits), heat > 0.999
-    surprise = tf.nn.softplus(-logits)  # -log p; with the logit it is -log(1 - p)
+    surprise = tf.nn.softplus(-logits)  # -log p; plus the logit, it is -log(1 - p)
     right = (1 - p) ** 2 * surprise
     wrong = (1 - heat) ** 4 * p**2 * (surprise + logits)
     found = tf.reduce_sum(tf.cast(peak, tf.float32))
@@ -69,7 +69,7 @@ def corners(raw: Any) -> Any:
 
 
 def box_loss(found: Any, wanted: Any, weights: Any) -> Any:
-    """Generalised IoU loss, weighted."""
+    """Weighted generalised IoU loss."""
 
     def area(low: Any, high: Any) -> Any:
         return tf.reduce_prod(tf.maximum(high - low, 0), -1)
@@ -83,13 +83,13 @@ def box_loss(found: Any, wanted: Any, weights: Any) -> Any:
 
 
 def computing_type() -> Any:
-    """Return bfloat16 where the processor multiplies matrices of it, else float32."""
+    """Return bfloat16 if the processor multiplies its matrices, else float32."""
     info = Path("/proc/cpuinfo")
     return tf.bfloat16 if info.exists() and "amx_bf16" in info.read_text() else tf.float32
 
 
 class Learner:
-    """All that a step changes, and how."""
+    """The weights, their moments and averages, and the optimiser."""
 
     def __init__(self, steps: int, seed: int) -> None:
         params, moments = net.init(seed)
@@ -108,19 +108,21 @@ class Learner:
         self.step = tf.function(self._step)
 
     def _step(self, batch: Batch, number: Any) -> Any:
-        """Do the step of this number; return (heat loss, box loss)."""
+        """Do one step; return (heat loss, box loss)."""
         pictures, heat, mask, boxes, weights = batch
-        weighed = tf.nest.flatten(self.params)
+        weights_of_net = tf.nest.flatten(self.params)
         with tf.GradientTape() as tape:
             shown = tf.cast(tf.cast(pictures, tf.float32) / 255, self._type)
             out, moments = net.apply(self.params, self.moments, shown, True)
             first = heat_loss(out[..., : len(CLASSES)], heat, mask)
             second = box_loss(corners(out[..., len(CLASSES) :]), boxes, weights)
             loss = first + BOX_WEIGHT * second
-        self._optimiser.apply(tape.gradient(loss, weighed), weighed)
+        self._optimiser.apply(tape.gradient(loss, weights_of_net), weights_of_net)
         tf.nest.map_structure(lambda old, new: old.assign(new), self.moments, moments)
-        kept = tf.minimum(AVERAGED, (1 + number) / (10 + number))  # the first weights count little
-        for mean, new in zip(tf.nest.flatten(self.averaged), weighed, strict=True):
+        kept = tf.minimum(
+            AVERAGE_DECAY, (1 + number) / (10 + number)
+        )  # lower at the start, to forget the first weights
+        for mean, new in zip(tf.nest.flatten(self.averaged), weights_of_net, strict=True):
             mean.assign(kept * mean + (1 - kept) * new)
         return tf.stack([first, second])
 
@@ -131,13 +133,13 @@ class Learner:
         ]
 
     def save(self, path: Path, number: int) -> None:
-        """Write everything to a file, and that this many steps are done."""
+        """Write a checkpoint after `number` steps."""
         values = [np.asarray(one) for one in self._variables()]
         path.with_suffix(".part").write_bytes(pickle.dumps((number, values)))
         path.with_suffix(".part").replace(path)
 
     def restore(self, path: Path) -> int:
-        """Read everything from a file; return the number of steps that are done."""
+        """Read a checkpoint; return its number of steps."""
         number, values = pickle.loads(path.read_bytes())
         for one, value in zip(self._variables(), values, strict=True):
             one.assign(value)
@@ -152,15 +154,15 @@ def stage(number: int, steps: int) -> Stage:
 def batches(
     pictures: Sequence[Labelled], first: int, steps: int, seed: int, ahead: int = 2
 ) -> Iterator[Batch]:
-    """Yield the batches of steps from `first` on; a thread makes them beside training."""
+    """Yield the batches of the steps from `first` on; a thread prepares them during training."""
 
     def make(number: int) -> Batch:
-        rng, now = np.random.default_rng([seed, number]), stage(number, steps)
-        chosen = rng.integers(len(pictures), size=now.batch)
-        made = [augment(rng, pictures[k], now.width, now.height) for k in chosen]
-        parts = [targets(one, now.height, now.width) for _, one in made]
+        rng, current = np.random.default_rng([seed, number]), stage(number, steps)
+        chosen = rng.integers(len(pictures), size=current.batch)
+        augmented = [augment(rng, pictures[k], current.width, current.height) for k in chosen]
+        parts = [targets(one, current.height, current.width) for _, one in augmented]
         stacked = (np.stack(part) for part in zip(*parts, strict=True))
-        return (np.stack([picture for picture, _ in made]), *stacked)
+        return (np.stack([picture for picture, _ in augmented]), *stacked)
 
     with ThreadPoolExecutor(1) as pool:
         jobs = {k: pool.submit(make, k) for k in range(first, min(first + ahead, steps))}
@@ -172,16 +174,16 @@ def batches(
 
 
 def learn(pictures: Sequence[Labelled], steps: int, folder: Path, seed: int = 0) -> Learner:
-    """Train for some steps; goes on from the folder's checkpoint where there is one."""
+    """Train up to `steps`; continue from the checkpoint in `folder`, if there is one."""
     folder.mkdir(parents=True, exist_ok=True)
     checkpoint = folder / "checkpoint.pickle"
     learner = Learner(steps, seed)
     first = learner.restore(checkpoint) if checkpoint.exists() else 0
-    begun, sums = time.monotonic(), np.zeros(2)
+    begin_s, sums = time.monotonic(), np.zeros(2)
     for number, batch in enumerate(batches(pictures, first, steps, seed), first):
         sums += learner.step(batch, tf.constant(number, tf.float32)).numpy()
         if (number + 1) % LOG_EVERY_STEPS == 0:
-            pace = (time.monotonic() - begun) / (number + 1 - first)
+            pace = (time.monotonic() - begin_s) / (number + 1 - first)
             sums /= LOG_EVERY_STEPS
             log.info("step %d: heat %.3f, box %.3f, %.3f s a step", number + 1, *sums, pace)
             sums[:] = 0

@@ -1,6 +1,6 @@
-"""Shapes of each class: parts of random proportions, standing on the floor, facing +x.
+"""Shapes of each class: parts of random proportions that stand on the floor and face +x.
 
-`wide` is 0 within the proportions of training and 1 for those beyond, which only tests draw.
+`wide` is 0 for proportions of training, and 1 for those beyond, which only tests use.
 """
 
 import math
@@ -19,7 +19,7 @@ UPRIGHT: Quaternion = (1.0, 0.0, 0.0, 0.0)
 
 @dataclass(frozen=True)
 class Geom:
-    """A geom: MuJoCo's type and half sizes [m], its pose, and what it is painted with.
+    """A geom: MuJoCo's type and half sizes [m], its pose, and its paint.
 
     Parts with the same paint share a colour that is drawn for each picture. `fixed` gives a
     colour (r, g, b) instead. Unlabelled parts are background.
@@ -37,21 +37,21 @@ class Geom:
 
 @dataclass(frozen=True)
 class Look:
-    """One thing: its class (empty for a distractor), parts, and how it may lie."""
+    """One thing: its class (empty for a distractor), its parts, and limits of its pose."""
 
     label: str
     parts: tuple[Geom, ...]
-    radius: float  # of the ground it takes [m]
+    radius: float  # [m], of the circle on the ground that it covers
     height: float  # [m]
-    hides: float = 0.0  # half the width that it hides [m]; 0 for its radius
+    hides: float = 0.0  # [m], half the width that it hides; 0 for its radius
     lies: float = 0.0  # chance to lie on its side
-    fits: bool = True  # most of it must be within the picture, or it cannot be asked for
-    facing: float = math.pi  # greatest yaw away from the camera [rad]
-    nearest: float = 0.5  # [m] from the camera
+    fits: bool = True  # it counts only if most of it is within the picture
+    facing: float = math.pi  # [rad], largest yaw away from the camera
+    nearest: float = 0.5  # [m], least distance from the camera
 
 
 def about(axis: Vector, angle: float) -> Quaternion:
-    """Return the quaternion of a turn about a unit axis [rad]."""
+    """Return the quaternion of a turn by `angle` [rad] about a unit axis."""
     s = math.sin(angle / 2)
     return (math.cos(angle / 2), axis[0] * s, axis[1] * s, axis[2] * s)
 
@@ -60,7 +60,7 @@ ALONG_Y = about((1.0, 0.0, 0.0), math.pi / 2)
 
 
 def ranged(rng: Random, low: float, high: float, wide: int, spread: float = 1.35) -> float:
-    """Draw from low to high; with `wide` from beyond, by up to the factor `spread`."""
+    """Draw from low to high; with `wide`, from beyond, by up to a factor of `spread`."""
     if not wide:
         return float(rng.uniform(low, high))
     if rng.random() < 0.5:
@@ -86,7 +86,7 @@ def rod(
 
 
 def cube(rng: Random, wide: int) -> Look:
-    """A plain cube, 6 to 24 cm, of one paint and nothing on it."""
+    """A plain cube of one paint, 6 to 24 cm."""
     e = ranged(rng, 0.03, 0.12, wide)
     return Look("cube", (Geom("box", (e, e, e), (0, 0, e)),), e * 1.42, 2 * e)
 
@@ -152,7 +152,7 @@ def person(rng: Random, wide: int) -> Look:
     tall = ranged(rng, 1.5, 1.95, wide, 1.2)
     fat = ranged(rng, 0.85, 1.2, wide, 1.25)
     hip, step = 0.5 * tall, rng.uniform(-0.45, 0.45)
-    sizes = {  # of ellipsoids, and how high their middles are
+    sizes = {  # half sizes and middles (x, z) of ellipsoids, and their paints
         "trunk": ((0.085 * fat, 0.12 * fat, 0.2), (0.0, 0.65), "shirt"),
         "hips": ((0.08 * fat, 0.1 * fat, 0.09), (0.0, 0.5), "trousers"),
         "head": ((0.058, 0.047, 0.068), (0.008, 0.925), "skin"),

@@ -1,8 +1,8 @@
 """The net: a small centre-based detector, described once for training and for export.
 
-A picture of 240 x 320 gives 30 x 40 cells of 8 px. Each has a logit for each class, which is
-highest at the middle of a thing, and the distances to the four sides of its box. The way to
-stride 16 sees 300 px around a cell. Training: TTFNet (Liu et al. 2020, arXiv 1909.00700).
+A picture of 240 x 320 gives 30 x 40 cells of 8 px. Each has a logit per class, with its maximum at
+the middle of a thing, and the distances to the four sides of the thing's box. The path at stride 16
+has a receptive field of 300 px. Training: TTFNet (Liu et al. 2020, arXiv 1909.00700).
 """
 
 from collections.abc import Mapping
@@ -15,13 +15,13 @@ from gigabrain_zenoh.vision.labels import CLASSES
 
 T = TypeVar("T")
 OUTPUTS = len(CLASSES) + 4
-PRIOR = -4.0  # logit of a class at the start: nearly all cells are empty
+PRIOR = -4.0  # initial logit of a class: nearly all cells are empty
 MOMENTUM, EPSILON = 0.98, 1e-3
 Params = dict[str, dict[str, Any]]
 
 
 class Ops(Protocol[T]):
-    """The operations of the net; a tensor is T."""
+    """The operations of the net on tensors of type T."""
 
     def conv(
         self,
@@ -37,7 +37,7 @@ class Ops(Protocol[T]):
         """Convolve; keeps height and width at stride 1."""
 
     def relu(self, x: T) -> T:
-        """Cut below zero."""
+        """Apply ReLU."""
 
     def add(self, a: T, b: T) -> T:
         """Add two tensors of one shape."""
@@ -60,15 +60,15 @@ def network(ops: Ops[T], picture: T) -> T:
 
 
 def _block(ops: Ops[T], x: T, name: str, channels: int, dilation: int = 1) -> T:
-    """Add what two convolutions make of x."""
+    """Return a residual block: x plus two convolutions of x."""
     y = ops.relu(ops.conv(x, f"{name}1", channels, dilation=dilation))
     return ops.relu(ops.add(x, ops.conv(y, f"{name}2", channels, dilation=dilation)))
 
 
 class TensorFlowOps:
-    """The net in TensorFlow. `training` uses the batch's own mean and variance.
+    """The net's operations in TensorFlow.
 
-    These are kept in `moments`, averaged with the old ones.
+    `training` uses the mean and variance of the batch; `moments` are their running averages.
     """
 
     def __init__(self, params: Params, moments: Params, training: bool) -> None:
@@ -111,22 +111,22 @@ class TensorFlowOps:
         return y
 
     def relu(self, x: Any) -> Any:
-        """Cut below zero."""
+        """Apply ReLU."""
         return tf.nn.relu(x)
 
     def add(self, a: Any, b: Any) -> Any:
-        """Add."""
+        """Add two tensors."""
         return a + b
 
     def double(self, x: Any) -> Any:
-        """Repeat cells."""
+        """Repeat each cell twice in both directions."""
         n, h, w, c = x.shape
         wide = tf.broadcast_to(x[:, :, None, :, None], (n, h, 2, w, 2, c))
         return tf.reshape(wide, (n, 2 * h, 2 * w, c))
 
 
-class _Sizes:
-    """Walks through the net with tensors that are numbers of channels, and makes weights."""
+class _WeightMaker:
+    """Creates the weights of the net; a tensor is its number of channels."""
 
     def __init__(self, rng: np.random.Generator) -> None:
         self._rng = rng
@@ -173,24 +173,24 @@ class _Sizes:
 
 def init(seed: int) -> tuple[Params, Params]:
     """Return the weights and moments of a new net."""
-    sizes = _Sizes(np.random.default_rng(seed))
+    sizes = _WeightMaker(np.random.default_rng(seed))
     network(sizes, 3)
     return sizes.params, sizes.moments
 
 
 def parameters(params: Mapping[str, Mapping[str, Any]]) -> int:
-    """Return how many numbers the exported net has (scales are folded into weights)."""
+    """Return the number of parameters of the exported net, without the folded scales."""
     return sum(own["w"].size + own["b"].size for own in params.values())
 
 
 def apply(params: Params, moments: Params, picture: Any, training: bool) -> tuple[Any, Params]:
-    """Run the net; return its outputs (float32) and the new moments. Computes in picture's type."""
+    """Run the net in the type of `picture`; return its outputs (float32) and the new moments."""
     ops = TensorFlowOps(params, moments, training)
     return network(ops, picture), ops.moments
 
 
 def fold(params: Params, moments: Params) -> dict[str, tuple[Any, Any]]:
-    """Return weights (h, w, in, out) and bias of each convolution, normalisation folded in."""
+    """Return weights (h, w, in, out) and bias of each convolution, with folded normalisation."""
     folded = {}
     for name, own in params.items():
         w, b = np.asarray(own["w"]), np.asarray(own["b"])

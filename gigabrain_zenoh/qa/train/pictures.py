@@ -1,4 +1,4 @@
-"""Sets of pictures with their truth: rendered in parts, one file for each studio."""
+"""Sets of rendered pictures with their labels, one file per studio."""
 
 import multiprocessing
 import zlib
@@ -18,10 +18,10 @@ QUALITY = (80, 97)  # of JPEG
 
 @dataclass(frozen=True)
 class Labelled:
-    """A picture as JPEG, and what is in it.
+    """A picture as JPEG, and the things in it.
 
     boxes: float32 (n, 4), left, top, right, bottom [px]; labels: int64 (n,);
-    fractions: float32 (n,), what is not hidden; ignored: bool (n,), too little is seen.
+    fractions: float32 (n,), visible shares; ignored: bool (n,), true if too little is visible.
     """
 
     jpeg: bytes
@@ -39,7 +39,7 @@ class Labelled:
 
 
 def degrade(rng: Random, picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Add what a camera adds: exposure, colour cast, blur, and noise."""
+    """Add the errors of a camera: exposure, colour cast, blur, and noise."""
     levels = np.linspace(0, 1, 256)[:, None] ** rng.uniform(0.8, 1.25)
     levels = 255 * levels * rng.uniform(0.85, 1.2) * rng.uniform(0.94, 1.06, 3)
     out = cv2.LUT(picture, np.clip(levels, 0, 255).astype(np.uint8)[:, None])
@@ -54,7 +54,7 @@ def degrade(rng: Random, picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
 
 
 def render_studio(split: str, number: int, folder: Path, count: int = PER_STUDIO) -> Path:
-    """Render the pictures of one studio to a file, unless it is there."""
+    """Render the pictures of one studio to a file, unless it exists."""
     from gigabrain_zenoh.qa.train.scene import SPLITS, StudioScene, Truth
     from gigabrain_zenoh.qa.train.studio import Studio
 
@@ -92,7 +92,7 @@ def render_studio(split: str, number: int, folder: Path, count: int = PER_STUDIO
 
 
 def render(split: str, count: int, folder: Path, processes: int = 2, first: int = 0) -> list[Path]:
-    """Render at least `count` pictures; what is there already is kept."""
+    """Render at least `count` pictures; existing files are kept."""
     folder.mkdir(parents=True, exist_ok=True)
     numbers = range(first, first + -(-count // PER_STUDIO))
     jobs = [(split, number, folder) for number in numbers]

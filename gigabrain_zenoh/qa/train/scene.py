@@ -1,4 +1,4 @@
-"""Draws a scene in a studio: room, lights, camera, paints, poses; and renders it with its truth."""
+"""Draws a scene in a studio: room, lights, camera, paints and poses. Renders it with labels."""
 
 import math
 from dataclasses import dataclass
@@ -17,19 +17,19 @@ from gigabrain_zenoh.vision.recognizer import HEIGHT_PX, WIDTH_PX
 
 FAR_M = 4.0
 MAX_THINGS = 6
-# Less of a thing than this cannot be asked for: it is to be ignored.
+# A thing of which less is visible is ignored.
 MIN_FRACTION, MIN_INSIDE, MIN_PIXELS, MIN_SIDE_PX = 0.4, 0.5, 60, 6
-SMALL_M = 0.4  # what is lower may stand on a table
-TRIES = 30
-DRAWN_PX = 14.0  # across: what is smaller stands nearer, so that it is as large in the picture
-OCCLUDED = 0.95  # share of things before which something is tried to be put
+SMALL_M = 0.4  # lower things may stand on a table
+TRIES = 30  # to find a free place
+MIN_DRAWN_PX = 14.0  # least size in the picture, which limits the distance of a thing
+OCCLUDED = 0.95  # share of things for which an occluder is tried
 SHARES = np.array((14, 14, 10, 14, 11, 9, 11, 11, 6)) / 100  # of the classes, in their order
 TEXTURED = {"label": 0.6, "print": 0.6, "shirt": 0.4, "leaf": 0.3, "wall": 0.4, "carton": 0.0}
-VIVID = {  # chance of a bright colour, by class; else it is close to grey
+VIVID = {  # chance of a bright colour, by class; otherwise it is close to grey
     "": 0.2, "cube": 0.9, "ball": 0.8, "cylinder": 0.8, "can": 0.8, "box": 0.2, "person": 0.4,
     "robot": 0.5, "charger": 0.2, "door": 0.2,
 }  # fmt: skip
-# hue [deg] and its spread, least and greatest saturation and value
+# hue [deg] and its spread, range of saturation, range of value
 HUES = {
     "carton": ((29.0, 4.0), (0.25, 0.5), (0.5, 0.9)),
     "tape": ((35.0, 4.0), (0.0, 0.5), (0.45, 0.95)),
@@ -40,12 +40,12 @@ HUES = {
 
 @dataclass(frozen=True)
 class Truth:
-    """One thing in a picture: class, box of what is seen (left, top, right, bottom) [px]."""
+    """One thing in a picture: its class, and the box of its visible part [px]."""
 
     label: int
-    box: tuple[int, int, int, int]
-    fraction: float  # of its pixels that nothing hides
-    ignored: bool  # too little of it is seen
+    box: tuple[int, int, int, int]  # left, top, right, bottom
+    fraction: float  # share of its pixels that is not hidden
+    ignored: bool  # too little of it is visible
 
 
 @dataclass(frozen=True)
@@ -73,7 +73,7 @@ class StudioScene:
         self._placed: list[tuple[Thing, float, float]] = []  # with x, y
 
     def draw(self) -> None:
-        """Draw all that one picture shows."""
+        """Draw everything for one picture."""
         rng = self._rng
         self._camera()
         self._room()
@@ -98,7 +98,7 @@ class StudioScene:
         mujoco.mj_camlight(self._model, self._data)
 
     def render(self) -> tuple[NDArray[np.uint8], list[Truth]]:
-        """Return the picture, RGB, and what is in it."""
+        """Return the picture, RGB, and the things in it."""
         studio = self._studio
         things = [thing for thing, _, _ in self._placed]
         studio.show(things)
@@ -114,7 +114,7 @@ class StudioScene:
         return expose(self._rng, picture), truths
 
     def _is_cut(self, thing: Thing, number: int, seen: NDArray[np.bool_]) -> bool:
-        """Return whether most of it is outside the picture, though it should fit."""
+        """Return whether most of a thing that should fit is outside the picture."""
         edges = seen[0].any() or seen[-1].any() or seen[:, 0].any() or seen[:, -1].any()
         if not (thing.look.fits and edges):
             return False
@@ -160,11 +160,11 @@ class StudioScene:
         for name, (at, turn, size) in walls.items():
             geom = model.geom(name)
             geom.pos, geom.quat, geom.size[:2] = at, turn, size
-        one = rng.integers(len(self._studio.flat_textures))  # of all walls, mostly
+        common = rng.integers(len(self._studio.flat_textures))  # for most walls
         for name in ("floor", "front", "left", "right"):
             material = model.material(name).id
             other = rng.integers(len(self._studio.flat_textures))
-            number = other if name == "floor" or rng.random() < 0.2 else one
+            number = other if name == "floor" or rng.random() < 0.2 else common
             plain = rng.random() < 0.35
             colour = textures.colour(rng, 0.1, 0.4)
             self._paint(material, -1 if plain else self._studio.flat_textures[number], colour)
@@ -218,7 +218,7 @@ class StudioScene:
             model.light_specular[n] = rng.uniform(0.1, 0.5)
 
     def _put_wanted(self, thing: Thing, table: Thing | None) -> None:
-        """Put a thing, on the table at times, and often something before it."""
+        """Put a thing on the floor, or sometimes on the table, often behind an occluder."""
         rng = self._rng
         if (
             table
@@ -227,7 +227,7 @@ class StudioScene:
             and self._put_on(thing, table)
         ):
             return
-        # small things far away are mostly a few pixels: draw the distance by its inverse at times
+        # far things are small: sometimes draw the inverse of the distance, to have more near ones
         near, far = thing.look.nearest, self._farthest(thing)
         if rng.random() < 0.5:
             distance = 1 / rng.uniform(1 / far, 1 / near)
@@ -237,13 +237,13 @@ class StudioScene:
             self._hide(thing)
 
     def _farthest(self, thing: Thing) -> float:
-        """Return how far away a thing may stand to be large enough in the picture [m]."""
+        """Return the largest distance at which a thing is large enough in the picture [m]."""
         focal = HEIGHT_PX / 2 / math.tan(self._fovy / 2)
         side = min(2 * thing.look.radius, thing.look.height)
-        return max(thing.look.nearest + 0.1, min(FAR_M, focal * side / DRAWN_PX))
+        return max(thing.look.nearest + 0.1, min(FAR_M, focal * side / MIN_DRAWN_PX))
 
     def _hide(self, thing: Thing) -> None:
-        """Put something before a thing that was just put, so that it hides a part of it."""
+        """Put an occluder in front of the newest thing, to hide a part of it."""
         rng = self._rng
         _, x, y = self._placed[-1]
         distance, side = math.hypot(x, y), rng.choice([-1, 1])
@@ -267,7 +267,7 @@ class StudioScene:
         return [t for t in self._studio.things if t.look.label not in ("", "door")]
 
     def _put(self, thing: Thing, distance: float, bearing: float | None = None) -> bool:
-        """Put a thing on the floor where nothing stands; return whether there was room."""
+        """Put a thing at a free place on the floor; return False if there is none."""
         rng, look = self._rng, thing.look
         half = math.atan(math.tan(self._fovy / 2) * WIDTH_PX / HEIGHT_PX)
         for _ in range(TRIES if bearing is None else 1):
@@ -284,13 +284,13 @@ class StudioScene:
         return False
 
     def _put_on(self, thing: Thing, table: Thing) -> bool:
-        """Put a small thing on the table where nothing stands yet."""
+        """Put a small thing at a free place on the table; return False if there is none."""
         rng, size = self._rng, table.look.parts[0].size
         _, x, y = next(placed for placed in self._placed if placed[0] is table)
         if math.hypot(x, y) > self._farthest(thing):
             return False
         if self._height < table.look.height - 0.1 and rng.random() < 0.6:
-            return False  # its top is not seen from here
+            return False  # the camera does not see the table's top
         turn = 2 * math.atan2(
             self._data.mocap_quat[table.mocap, 3], self._data.mocap_quat[table.mocap, 0]
         )
@@ -310,7 +310,7 @@ class StudioScene:
         return False
 
     def _set(self, thing: Thing, x: float, y: float, z: float) -> None:
-        """Put a thing at a place, with a new turn and new colours."""
+        """Put a thing at a place [m], with a random turn and random colours."""
         rng, look = self._rng, thing.look
         yaw = math.atan2(y, x) + math.pi + rng.uniform(-look.facing, look.facing)
         turn = np.array(about((0, 0, 1), yaw))
@@ -324,7 +324,7 @@ class StudioScene:
             self._repaint(look.label, paint, material)
 
     def _repaint(self, label: str, paint: str, material: int) -> None:
-        """Draw colour and texture by what a paint stands for, on a thing of this class."""
+        """Draw colour and texture of a material, by its paint and the thing's class."""
         rng = self._rng
         textured = rng.random() < TEXTURED.get(paint, 0.25)
         if paint in HUES:
@@ -342,14 +342,14 @@ class StudioScene:
 
 
 def _elevation(rng: Random, other: bool) -> tuple[float, float]:
-    """Return the least and the greatest elevation of a light [rad]; training leaves a gap."""
+    """Return the range of a light's elevation [rad]; training and test ranges do not overlap."""
     if other:
         return 0.35, 0.75
     return (0.75, 1.5) if rng.random() < 0.7 else (0.0, 0.35)
 
 
 def expose(rng: Random, picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Make the mean brightness what a camera's automatic exposure makes of it."""
+    """Set the mean brightness like a camera's automatic exposure."""
     gain = np.clip(rng.uniform(90, 140) / max(float(picture.mean()), 1.0), 0.6, 4.0)
     return np.asarray(np.clip(picture * gain, 0, 255), np.uint8)
 

@@ -1,4 +1,4 @@
-"""Average precision at an overlap of a half, by COCO's rules: 101 points, ignored boxes."""
+"""Average precision at an IoU of 0.5, by COCO's rules: 101 points, ignored boxes."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -12,15 +12,15 @@ from gigabrain_zenoh.vision.labels import CLASSES
 from gigabrain_zenoh.vision.recognizer import Found, Recognizer
 
 OVERLAP = 0.5
-LOWEST = 0.01  # confidence that counts; the curve needs the unsure ones too
-HIDDEN = 0.95  # of which less is seen is partly hidden
+MIN_CONFIDENCE = 0.01  # low, as the curve needs unsure findings too
+HIDDEN = 0.95  # things with a smaller visible share are partly hidden
 RECALLS = np.linspace(0, 1, 101)
 Floats = NDArray[np.float32]
 
 
 @dataclass(frozen=True)
 class Wanted:
-    """The things in a picture: boxes (n, 4) [px], labels (n,), and those that may be missed."""
+    """The things in a picture: boxes (n, 4) [px], labels (n,), and flags to ignore them (n,)."""
 
     boxes: Floats
     labels: NDArray[np.int64]
@@ -28,7 +28,7 @@ class Wanted:
 
 
 def overlaps(found: Floats, wanted: Floats, ignored: NDArray[np.bool_]) -> Floats:
-    """Return the IoU of each found with each wanted box; of ignored ones, the share of found."""
+    """Return the IoU of each found and each wanted box; for ignored ones, the share of `found`."""
     low = np.maximum(found[:, None, :2], wanted[None, :, :2])
     high = np.minimum(found[:, None, 2:], wanted[None, :, 2:])
     both = np.prod(np.maximum(high - low, 0), axis=-1)
@@ -38,12 +38,12 @@ def overlaps(found: Floats, wanted: Floats, ignored: NDArray[np.bool_]) -> Float
 
 
 def match(guess: Found, wanted: Wanted, label: int) -> tuple[Floats, NDArray[np.int8]]:
-    """Return the confidences of a class, surest first, with 1 right, 0 wrong, -1 ignored."""
+    """Return a class's confidences, highest first, and verdicts: 1 right, 0 wrong, -1 ignored."""
     own = guess.labels == label
     order = np.argsort(-guess.confidences[own], kind="stable")
     found, confidences = guess.boxes[own][order], guess.confidences[own][order]
-    there = wanted.labels == label
-    boxes, ignored = wanted.boxes[there], wanted.ignored[there]
+    is_class = wanted.labels == label
+    boxes, ignored = wanted.boxes[is_class], wanted.ignored[is_class]
     shares, taken = overlaps(found, boxes, ignored), np.zeros(len(boxes), bool)
     verdicts = np.zeros(len(found), np.int8)
     for k, share in enumerate(shares):
@@ -56,7 +56,7 @@ def match(guess: Found, wanted: Wanted, label: int) -> tuple[Floats, NDArray[np.
 
 
 def average_precision(guesses: Sequence[Found], truths: Sequence[Wanted], label: int) -> float:
-    """Return a class's average precision over all pictures; nan where it is in none."""
+    """Return a class's average precision over all pictures; nan if it is in none."""
     pairs = [match(guess, truth, label) for guess, truth in zip(guesses, truths, strict=True)]
     count = sum(int(((t.labels == label) & ~t.ignored).sum()) for t in truths)
     if not count:
@@ -76,21 +76,21 @@ def table(guesses: Sequence[Found], truths: Sequence[Wanted]) -> dict[str, float
 
 
 def run(pictures: Sequence[Labelled], weights: Path) -> tuple[list[Found], list[Wanted]]:
-    """Return what a net finds in pictures, and what is there."""
-    recognizer = Recognizer(weights, min_confidence=LOWEST)
+    """Return a net's findings in pictures, and the things in them."""
+    recognizer = Recognizer(weights, min_confidence=MIN_CONFIDENCE)
     guesses = [recognizer.find(one.picture()) for one in pictures]
     return guesses, [Wanted(one.boxes, one.labels, one.ignored) for one in pictures]
 
 
 def describe(split: str, pictures: Sequence[Labelled]) -> str:
-    """Return one line on a set: pictures, things, and how many are partly hidden."""
+    """Return a line about a set: numbers of pictures and things, and the share of hidden ones."""
     counted = np.concatenate([one.fractions[~one.ignored] for one in pictures])
     hidden = float((counted < HIDDEN).mean())
     return f"{split}: {len(pictures)} pictures, {len(counted)} things, {hidden:.0%} partly hidden"
 
 
 def text(columns: Mapping[str, Mapping[str, float]]) -> str:
-    """Return a table in Markdown: a row for each class and one for the mean."""
+    """Return a Markdown table with a row per class and one for the mean."""
     rows = [f"| AP@50 | {' | '.join(columns)} |", f"|---|{'---|' * len(columns)}"]
     for name in CLASSES:
         rows.append(f"| {name} | {' | '.join(f'{c[name]:.3f}' for c in columns.values())} |")

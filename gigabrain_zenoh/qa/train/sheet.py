@@ -1,4 +1,4 @@
-"""A sheet of pictures: found in green, wrong in red, what is there in white (named if missed)."""
+"""A sheet of pictures: right findings green, wrong ones red, things white (named if missed)."""
 
 from collections.abc import Sequence
 
@@ -17,9 +17,9 @@ MIN_CONFIDENCE = 0.3
 
 
 def mistakes(one: Labelled, found: Found) -> int:
-    """Return how many things were missed and how many findings are wrong."""
-    right, there = _hits(one, found)
-    return int((~right).sum() + (~there & ~one.ignored).sum())
+    """Return the number of missed things plus that of wrong findings."""
+    right, detected = _hits(one, found)
+    return int((~right).sum() + (~detected & ~one.ignored).sum())
 
 
 def sheet(pictures: Sequence[Labelled], found: Sequence[Found]) -> NDArray[np.uint8]:
@@ -35,7 +35,7 @@ def _sure(found: Found) -> NDArray[np.bool_]:
 
 
 def _hits(one: Labelled, found: Found) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """Return which of the sure findings are right, and which things were found."""
+    """Return flags of right findings, among the sure ones, and of detected things."""
     sure = _sure(found)
     shares = overlaps(found.boxes[sure], one.boxes, one.ignored)
     hits = (shares >= OVERLAP) & (found.labels[sure][:, None] == one.labels[None])
@@ -44,8 +44,8 @@ def _hits(one: Labelled, found: Found) -> tuple[NDArray[np.bool_], NDArray[np.bo
 
 def _tile(one: Labelled, found: Found) -> NDArray[np.uint8]:
     picture, sure = one.picture().copy(), _sure(found)
-    right, there = _hits(one, found)
-    for box, label, ignored, hit in zip(one.boxes, one.labels, one.ignored, there, strict=True):
+    right, detected = _hits(one, found)
+    for box, label, ignored, hit in zip(one.boxes, one.labels, one.ignored, detected, strict=True):
         missed = "" if hit or ignored else CLASSES[label]
         _rectangle(picture, box, GREY if ignored else WHITE, missed)
     for box, label, hit in zip(found.boxes[sure], found.labels[sure], right, strict=True):

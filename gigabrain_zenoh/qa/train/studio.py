@@ -1,6 +1,6 @@
-"""A MuJoCo model with things of all classes, repainted and put elsewhere for each picture.
+"""A MuJoCo model with things of all classes, which are painted and placed for each picture.
 
-To make a model and its renderer takes 0.5 s, a picture some 20 ms: so one studio is used for many.
+A model and its renderer take 0.5 s, a picture about 20 ms. So one studio is used for many pictures.
 """
 
 from collections.abc import Callable, Iterable
@@ -20,11 +20,12 @@ from gigabrain_zenoh.vision.recognizer import HEIGHT_PX, WIDTH_PX
 VARIANTS = 2  # looks of each class in one studio
 CUBE_TEXTURES, FLAT_TEXTURES = 14, 8
 CUBE_PX, FLAT_PX = 48, 192
-OF_ROOMS, OF_THINGS = ((0.1, 0.4), 0.15), ((0.2, 0.6), 0.5)  # textures: contrast, bright colours
+# range of a texture's contrast, and chance of bright colours
+OF_ROOMS, OF_THINGS = ((0.1, 0.4), 0.15), ((0.2, 0.6), 0.5)
 SHOWN, HIDDEN = 0, 5  # groups of geoms
-SMOOTH_EDGES = 0.3  # share of studios with multisampling, which makes a picture cost thrice as much
+SMOOTH_EDGES = 0.3  # share of studios with multisampling, which takes three times as long
 TRAINED_BODIES = ("turtlebot3_burger", "turtlebot3_waffle", "skid_rover", "ackermann_car")
-OTHER_BODIES = ("omni_disc", "mecanum_cart")  # only in tests of other proportions
+OTHER_BODIES = ("omni_disc", "mecanum_cart")  # only for tests with other proportions
 RGB = int(mujoco.mjtTextureRole.mjTEXROLE_RGB)
 GEOMS = {
     kind: getattr(mujoco.mjtGeom, f"mjGEOM_{kind.upper()}")
@@ -34,7 +35,7 @@ GEOMS = {
 
 @dataclass
 class Thing:
-    """A thing of the studio: its look, its body's number among the movable ones, its geoms."""
+    """A thing of the studio: its look, the mocap number of its body, and its geoms."""
 
     look: Look
     mocap: int
@@ -44,9 +45,9 @@ class Thing:
 
 
 class Studio:
-    """The model, its data and renderers. Close it after use.
+    """A model, its data and its renderer. Close it after use.
 
-    `wide` draws things beyond the proportions of training; `families` are the textures.
+    `wide` draws proportions beyond those of training; `families` are the textures.
     """
 
     def __init__(self, rng: Random, families: tuple[textures.Family, ...], wide: int) -> None:
@@ -76,7 +77,7 @@ class Studio:
         self._drawing = Drawing(self.model, 0, WIDTH_PX, HEIGHT_PX)
 
     def close(self) -> None:
-        """Free what OpenGL holds."""
+        """Free OpenGL's memory."""
         self._drawing.close()
 
     def _fill(self, texture: int, rng: Random, families: tuple[textures.Family, ...]) -> None:
@@ -107,7 +108,7 @@ class Studio:
         return Thing(look, int(body.mocapid[0]), seen, seen)
 
     def show(self, things: Iterable[Thing], *, room: bool = True, labelled: bool = False) -> None:
-        """Show these things only, with or without floor and walls, or only their labelled parts."""
+        """Show only these things, or their labelled parts, with or without floor and walls."""
         self.model.geom_group[:] = HIDDEN
         if room:
             self.model.geom_group[self.model.geom_bodyid == 0] = SHOWN
@@ -115,11 +116,11 @@ class Studio:
             self.model.geom_group[thing.labelled if labelled else thing.geoms] = SHOWN
 
     def picture(self) -> NDArray[np.uint8]:
-        """Render what is shown (h, w, 3), RGB."""
+        """Render a picture (h, w, 3), RGB."""
         return self._drawing.colours(self.data, self._options)
 
     def owners(self) -> NDArray[np.int64]:
-        """Return the number of the thing seen in each pixel (h, w); -1 for none."""
+        """Return the number of the visible thing for each pixel (h, w); -1 for none."""
         return np.asarray(self.owner[self._drawing.geoms(self.data, self._options)])
 
 
@@ -155,7 +156,7 @@ def _material(spec: mujoco.MjSpec, name: str, texture: str = "") -> None:
 
 
 def _room(spec: mujoco.MjSpec) -> None:
-    """Floor, three walls, lights and the camera; where they are is drawn for each picture."""
+    """Add floor, three walls, lights and the camera; their poses are drawn for each picture."""
     plane = mujoco.mjtGeom.mjGEOM_PLANE
     for name in ("floor", "front", "left", "right"):
         _material(spec, name, "flat0")

@@ -1,4 +1,4 @@
-"""Targets of the net for a picture, and random changes of pictures in training."""
+"""The net's targets for a picture, and random changes of pictures for training."""
 
 import cv2
 import numpy as np
@@ -9,9 +9,9 @@ from gigabrain_zenoh.qa.train.pictures import Labelled, degrade
 from gigabrain_zenoh.vision.labels import CLASSES
 from gigabrain_zenoh.vision.recognizer import STRIDE_PX
 
-CORE = 0.54  # share of a box in which cells answer for it
+CORE = 0.54  # share of a box, whose cells predict the box
 ZOOM = (0.8, 1.5)
-MIN_LEFT = 0.45  # share of a box that must be left by cutting, or it is to be ignored
+MIN_LEFT = 0.45  # a box is ignored if a smaller share of it is left after cropping
 
 Floats = NDArray[np.float32]
 Target = tuple[Floats, Floats, Floats, Floats]
@@ -20,7 +20,7 @@ Target = tuple[Floats, Floats, Floats, Floats]
 def augment(
     rng: Random, one: Labelled, width: int, height: int
 ) -> tuple[NDArray[np.uint8], Labelled]:
-    """Decode, scale, mirror, zoom, shift, and degrade a picture; its boxes follow."""
+    """Decode, scale, mirror, zoom, shift, and degrade a picture, and move its boxes."""
     picture, boxes = one.picture(), one.boxes.copy()
     if picture.shape[:2] != (height, width):
         boxes *= np.tile([width, height], 2) / np.tile(picture.shape[1::-1], 2)
@@ -47,7 +47,7 @@ def augment(
 
 
 def relight(rng: Random, picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Change the light: a colour cast, contrast, and more light on one side than on the other."""
+    """Change the light: colour cast, contrast, and a gradient of brightness."""
     h, w = picture.shape[:2]
     levels = np.linspace(0, 1, 256)[:, None] ** rng.uniform(0.7, 1.4) * rng.uniform(0.65, 1.15, 3)
     out = cv2.LUT(picture, (255 * np.clip(levels, 0, 1)).astype(np.uint8)[:, None])
@@ -84,7 +84,7 @@ def targets(one: Labelled, height: int, width: int) -> Target:
 
 
 def _bump(low: float, high: float, n: int) -> Floats:
-    """Return a Gauss bump along one side of a box: 1 in its middle cell, 0 outside its core."""
+    """Return a Gaussian (n,) along one side of a box: 1 in its middle cell, 0 outside its core."""
     middle = min(int((low + high) / 2), n - 1)
     radius = int((high - low) / 2 * CORE)
     sigma = (2 * radius + 1) / 6

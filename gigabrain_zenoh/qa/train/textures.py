@@ -7,12 +7,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 Picture = NDArray[np.uint8]  # (n, n, 3), RGB
-Grey = NDArray[np.float32]  # (n, n), 0 to 1: the share of the second colour
+Grey = NDArray[np.float32]  # (n, n), share of the second colour, 0 to 1
 Random = np.random.Generator
 
 
 def _grid(n: int) -> tuple[Grey, Grey]:
-    """Return u and v of each pixel, 0 to 1."""
+    """Return the coordinates u and v of each pixel, 0 to 1."""
     v, u = np.indices((n, n)).astype(np.float32) / n
     return u, v
 
@@ -122,7 +122,7 @@ TEST: tuple[Family, ...] = (plain, marble, plaid, hexagons, waves)
 
 
 def colour(rng: Random, vivid: float = 0.5, darkest: float = 0.15) -> NDArray[np.float32]:
-    """Draw a colour, RGB from 0 to 1: with chance `vivid` any hue, else close to grey."""
+    """Draw a colour, RGB from 0 to 1: bright with chance `vivid`, else close to grey."""
     saturation = rng.uniform(0.45, 1.0) if rng.random() < vivid else rng.uniform(0.0, 0.2)
     hsv = np.array([[[rng.uniform(0, 360), saturation, rng.uniform(darkest, 1.0)]]], np.float32)
     return np.asarray(cv2.cvtColor(hsv, cv2.COLOR_HSV2RGB)[0, 0], np.float32)
@@ -131,7 +131,7 @@ def colour(rng: Random, vivid: float = 0.5, darkest: float = 0.15) -> NDArray[np
 def draw(
     rng: Random, families: tuple[Family, ...], n: int, contrast: float = 1.0, vivid: float = 0.3
 ) -> Picture:
-    """Draw an n by n texture of one of the families in two colours."""
+    """Draw a texture (n, n, 3) of one of the families, in two colours."""
     share = families[rng.integers(len(families))](rng, n)[..., None] * contrast
     first, second = colour(rng, vivid, 0.3), colour(rng, vivid, 0.3)
     picture = first * (1 - share) + second * share
