@@ -1,4 +1,4 @@
-"""Inputs of the navigator: poses, map, commands and body, as known at one scan."""
+"""Inputs of the navigator: poses, map, commands and body, as known at the time of a scan."""
 
 from collections import deque
 from dataclasses import dataclass
@@ -30,31 +30,31 @@ from gigabrain_zenoh.geometry.pose import PoseHistory, compose, inverse, velocit
 MAX_POSE_AGE_NS = 1_000_000_000
 SENT_TICKS = 25  # local planning uses the commands of the last half second
 OPERATOR_HOLDS = "an operator holds the body; `gigabrain enable` hands it back"
-USUAL_LATENCY_TICKS = 2  # from a scan to the first state after its answer
+USUAL_LATENCY_TICKS = 2  # from a scan to the first state that follows its intent
 LATENCY_MEMORY_TICKS = 100
-STOPPED_TICKS = 75  # ahead, after which another way out is wanted
+STOPPED_AHEAD_TICKS = 75  # then the local planner looks for another way out
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class NavigationContext:
-    """Everything that one step of the navigator depends on."""
+    """All inputs of one step of the navigator."""
 
     tick: int  # of the scan
     world: WorldModel | None  # None while perception is silent
     pose: Pose  # in the odometry frame
     must_charge: bool
     late_ticks: int  # age of the scan
-    delayed_s: float  # [s], by how much scans have lately been answered later than usual
+    delayed_s: float  # [s], recent latency of intents beyond the usual one
     velocity: Velocity  # measured at the scan
     may_reverse: bool
-    stopped_ahead: bool  # safety has kept it from advancing for a while
+    stopped_ahead: bool  # safety forbids driving forward, since at least STOPPED_AHEAD_TICKS
     body: BodyDescription | None
     map_from_odom: Pose | None
     lost: WaitReason | None  # why `map_from_odom` is None
     actuation: ActuationModel
     sent: tuple[SentCommand, ...]
-    held: str  # why the body does not follow decision, for people; empty while it does
-    slowed_by: str  # causes that safety reports, for people
+    held: str  # reason, shown to users, why the body ignores decision; else empty
+    slowed_by: str  # causes that safety reports, shown to users
     zones: tuple[Zone, ...]
 
     @property
@@ -66,36 +66,36 @@ class NavigationContext:
 
 
 class ScanLatency:
-    """Measures how much longer than usual the answers to scans took in the last two seconds.
+    """Measures the latency from scans to their intents in the last two seconds.
 
-    An answer ends at the next state that is processed: states wait while the process computes or is
-    not scheduled. In lock-step every answer is in time.
+    It is measured up to the next state that is processed: states wait while the process computes or
+    is not scheduled. In lock-step there is no excess latency.
     """
 
     def __init__(self) -> None:
         self._boot = 0
-        self._open: tuple[int, int] | None = None  # tick in which the answer began, and of its scan
-        self._late: deque[tuple[int, int]] = deque()  # tick, and latency [ticks]
+        self._pending: tuple[int, int] | None = None  # ticks of the open step and its scan
+        self._latencies: deque[tuple[int, int]] = deque()  # tick, and latency [ticks]
 
     def observe_state(self, boot: int, tick: int) -> None:
         """Record that a state is being processed."""
         if boot != self._boot:
-            self._boot, self._open = boot, None
-            self._late.clear()
-        if self._open and tick > self._open[0]:
-            self._late.append((tick, tick - 1 - self._open[1]))
-            self._open = None
-        while self._late and tick - self._late[0][0] > LATENCY_MEMORY_TICKS:
-            self._late.popleft()
+            self._boot, self._pending = boot, None
+            self._latencies.clear()
+        if self._pending and tick > self._pending[0]:
+            self._latencies.append((tick, tick - 1 - self._pending[1]))
+            self._pending = None
+        while self._latencies and tick - self._latencies[0][0] > LATENCY_MEMORY_TICKS:
+            self._latencies.popleft()
 
     def begin(self, tick: int, basis: int) -> None:
-        """Record that in this tick the answer to the scan of tick `basis` begins."""
-        self._open = tick, basis
+        """Record that the step for the scan of tick `basis` begins at `tick`."""
+        self._pending = tick, basis
 
     @property
     def excess_s(self) -> float:
-        """The largest latency beyond the usual one [s]; 0 if there is none."""
-        longest = max((late for _, late in self._late), default=0)
+        """The largest latency beyond the usual one [s], or 0."""
+        longest = max((latency for _, latency in self._latencies), default=0)
         return max(0, longest - USUAL_LATENCY_TICKS) * TICK_NS / 1e9
 
 
@@ -112,7 +112,7 @@ class ContextSource:
         self._commands: PreviousTick[CmdVel] = PreviousTick()
         self._joint_commands: PreviousTick[JointCommand] = PreviousTick()
         self._subscribed_commands = False
-        self._stopped: int | None = None  # tick since which safety has stopped the body ahead
+        self._stopped_since: int | None = None  # tick; None while safety lets the body advance
         self._bodies = bus.latest(BODY)
         bus.latest(POSE, self._poses.receive)
         bus.latest(MAP, self._maps.append)
@@ -134,7 +134,7 @@ class ContextSource:
     def at_scan(
         self, state: RobotState, world: WorldModel | None, verdict: SafetyState | None
     ) -> NavigationContext:
-        """Return what is known at the scan of `world`, or at `state` without one."""
+        """Return the inputs at the scan of `world`, or at `state` if `world` is None."""
         tick = world.basis if world else state.tick
         if world:
             self._latency.begin(state.tick, tick)
@@ -143,10 +143,10 @@ class ContextSource:
         if pose is None:
             map_from_odom, lost = None, WaitReason.NO_ODOMETRY_OF_SCAN
         sent = self._estimator.sent(tick - SENT_TICKS, tick - 1)
-        if verdict is None or not any(one.code == "zone_ahead" for one in verdict.causes):
-            self._stopped = None
-        elif self._stopped is None or tick < self._stopped:
-            self._stopped = tick
+        if verdict is None or not any(cause.code == "zone_ahead" for cause in verdict.causes):
+            self._stopped_since = None
+        elif self._stopped_since is None or tick < self._stopped_since:
+            self._stopped_since = tick
         return NavigationContext(
             tick=tick,
             world=world,
@@ -156,14 +156,15 @@ class ContextSource:
             delayed_s=self._latency.excess_s,
             velocity=self._velocity(state, tick),
             may_reverse=verdict is None or verdict.caps.backward != 0.0,
-            stopped_ahead=self._stopped is not None and tick - self._stopped >= STOPPED_TICKS,
+            stopped_ahead=self._stopped_since is not None
+            and tick - self._stopped_since >= STOPPED_AHEAD_TICKS,
             body=self.body,
             map_from_odom=map_from_odom,
             lost=lost,
             actuation=self._estimator.response,
-            sent=tuple(SentCommand(*one) for one in sent),
+            sent=tuple(SentCommand(*fields) for fields in sent),
             held=self.held(state),
-            slowed_by="; ".join(one.text for one in verdict.causes)[:300] if verdict else "",
+            slowed_by="; ".join(cause.text for cause in verdict.causes)[:300] if verdict else "",
             zones=self._zones.at(state.boot, tick).zones,
         )
 
@@ -175,55 +176,55 @@ class ContextSource:
 
     @property
     def lost(self) -> WaitReason | None:
-        """Return why the robot's pose in the map is unknown now; None if it is known."""
+        """Return why the robot's current pose in the map is unknown; None if it is known."""
         return self._map_from_odom(self._bus.time.boot, self._bus.time.tick)[1]
 
     def here(self, boot: int, tick: int) -> Pose | None:
-        """Return the robot's pose in the map at `tick`, as far as it is known."""
+        """Return the robot's pose in the map at `tick`; None if it is unknown."""
         map_from_odom, _ = self._map_from_odom(boot, tick)
         pose = self._history.at(boot, tick)
         return compose(map_from_odom, pose) if map_from_odom and pose else None
 
     def oriented(self, state: RobotState) -> bool:
-        """Return whether there are a map and a pose in it."""
+        """Return whether the map and the robot's pose in it are known."""
         lost = self._map_from_odom(state.boot, state.tick)[1]
         return lost is None and self.grid(state.boot, state.tick) is not None
 
     def grid(self, boot: int, tick: int) -> OccupancyGrid | None:
-        """Return the newest map from before `tick`, or from an earlier run of the driver.
+        """Return the newest map of before `tick`, or of an earlier start of the driver.
 
         A map is published only when it changes, and stays valid when the driver restarts.
         """
-        earlier = (one for one in reversed(self._maps) if one.boot != boot or one.tick < tick)
+        earlier = (grid for grid in reversed(self._maps) if grid.boot != boot or grid.tick < tick)
         return next(earlier, None)
 
     def _on_command(self, _key: str, command: CmdVel) -> None:
-        """Record a command, clamped as by the gate: the body follows the clamped one."""
+        """Record a command, clamped like in the gate: the body follows the clamped one."""
         if body := self.body:
-            obeyed = clamp(velocity_of(command), limits_of(body))
-            self._estimator.add_command(replace(command, **asdict(obeyed)))
+            clamped = clamp(velocity_of(command), limits_of(body))
+            self._estimator.add_command(replace(command, **asdict(clamped)))
         if command.source == BRAIN:
             self._commands.receive(command)
 
     def _velocity(self, state: RobotState, tick: int) -> Velocity:
-        """Return the speed measured at `tick` or last before it; the newest if none is kept."""
-        known = (one for one in reversed(self._states) if one.boot == state.boot)
-        return next((one.velocity for one in known if one.tick <= tick), state.velocity)
+        """Return the newest velocity measured until `tick`; if none is stored, that of `state`."""
+        states = (past for past in reversed(self._states) if past.boot == state.boot)
+        return next((past.velocity for past in states if past.tick <= tick), state.velocity)
 
     def _map_from_odom(self, boot: int, tick: int) -> tuple[Pose | None, WaitReason | None]:
         """Return the odometry frame's pose in the map, or None and the reason."""
-        found = self._poses.at(boot, tick, MAX_POSE_AGE_NS)
-        if found is None:
+        in_map = self._poses.at(boot, tick, MAX_POSE_AGE_NS)
+        if in_map is None:
             return None, WaitReason.NO_LOCALIZATION
-        if not found.localized:
+        if not in_map.localized:
             return None, WaitReason.NOT_LOCALIZED
-        then = self._history.at(boot, found.basis)
-        if then is None:
+        in_odom = self._history.at(boot, in_map.basis)
+        if in_odom is None:
             return None, WaitReason.NO_ODOMETRY_OF_POSE
-        return compose(Pose(x=found.x, y=found.y, yaw=found.yaw), inverse(then)), None
+        return compose(Pose(x=in_map.x, y=in_map.y, yaw=in_map.yaw), inverse(in_odom)), None
 
     def held(self, state: RobotState) -> str:
-        """Return why the body does not follow decision, for people; empty while it does."""
+        """Return a reason, shown to users, why the body ignores decision; else an empty text."""
         gate = state.gate
         if gate.mode != "enabled":
             why = "; ".join(cause.text for cause in gate.causes)

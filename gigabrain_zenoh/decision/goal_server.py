@@ -1,4 +1,4 @@
-"""Steps what the tasks want: the queue of goals and missions, and the navigator.
+"""Input source that steps the task queue, the navigator and the manipulator.
 
 The robot can drive before the planning kernels are compiled.
 """
@@ -47,16 +47,16 @@ if TYPE_CHECKING:
 
 NOT_BEGUN = Idle("waiting", "waiting: for the body and the map's places, to begin its mission")
 COMPILING = "mapping and planning compile meanwhile, once per installation"
-FIRST_MAP_TICKS = 3000  # how long after the kernels a first map may come
-STARTING_STATUS_NS = 200_000_000  # of the status, while the kernels compile
+FIRST_MAP_TICKS = 3000  # wait for a first map, once the kernels are loaded
+STARTING_STATUS_NS = 200_000_000  # period of the status while the kernels compile
 POSE_TIMEOUT_NS, POLL_NS = 700_000_000, 50_000_000  # wait for a first pose in the map
 
 
 class GoalServer(InputSource):
     """Input source of behaviours that drive by a map: the task queue and the navigator.
 
-    At the first start of an installation the robot can drive before the kernels are compiled: with
-    `start: explore` it then roams by `avoid`, until there is a map or somebody gives it a task.
+    The kernels are compiled at the first start of an installation. Meanwhile, with
+    `start: explore`, the robot roams by `avoid` until it gets a map or a task.
     """
 
     moves_arms = True
@@ -72,18 +72,18 @@ class GoalServer(InputSource):
         self._kernels = DriveKernels(bus.input_log.in_time)
         self._compile_first = config.compile_first or not bus.input_log.live
         self._avoid = Avoid(_roaming(settings))  # drives without a map
-        self._loaded = False  # the kernels that this body needs
-        self._began_late = False  # there were steps without the kernels
-        self._loaded_tick: int | None = None  # of the first step with them
+        self._loaded = False  # the kernels for this body
+        self._stepped_unloaded = False  # before the kernels were loaded
+        self._loaded_tick: int | None = None  # of the first step with kernels
         self._navigator: Navigator | None = None  # once the kernels are loaded
-        self._manipulator: Manipulator | None = None  # likewise, of a body with an arm
+        self._manipulator: Manipulator | None = None  # once an arm needs it
         self._outcome: StepOutcome | None = None  # of the last command
-        self._started = False  # what it does by itself
-        self._first = _first_mission(settings)
-        self._checked = 0  # number of a command that the arm can carry out
+        self._start_mission = _start_mission(settings)
+        self._start_mission_begun = False
+        self._checked_number = 0  # of the last command that the arm can carry out
 
     async def prepare(self) -> None:
-        """Load the kernels, or begin to compile them. Raises ConfigError."""
+        """Load the kernels, or start to compile them. Raises ConfigError."""
         publishing = asyncio.ensure_future(self._publish_starting())
         try:
             self._loaded = await self._kernels.load(wait=self._compile_first)
@@ -93,11 +93,11 @@ class GoalServer(InputSource):
             self._make_navigator()
 
     async def finish_preparing(self) -> None:
-        """Return once the kernels are loaded. Raises ConfigError."""
+        """Wait until the kernels are loaded. Raises ConfigError."""
         await self._kernels.finish()
 
     def configure(self, config: NavigationConfig) -> None:
-        """Use another speed limit from now on."""
+        """Replace the settings."""
         self._config = config
         self._avoid.configure(_roaming(config))
         if self._navigator:
@@ -116,7 +116,7 @@ class GoalServer(InputSource):
         verdict: SafetyState | None,
         objects: ObjectsByPerceptor,
     ) -> StepResult:
-        """Advance the queue and step the behaviour with the command that it wants."""
+        """Advance the queue, and step the behaviour with its command."""
         body = self._source.body
         if body and not body.has_base:
             self._begin(state, body)
@@ -142,61 +142,62 @@ class GoalServer(InputSource):
                 must_charge=context.must_charge,
                 objects=objects,
                 command=command if isinstance(command, DriveCommand) else None,
-                drive=lambda wanted: navigator.drive(wanted, idle),
+                drive=lambda drive_command: navigator.drive(drive_command, idle),
             )
         )
         if body and (isinstance(command, ArmCommand) or self._manipulator or self._may_hold(body)):
-            moved, done = self._move_arm(state, body, command, idle)
+            arm_intent, arm_outcome = self._move_arm(state, body, command, idle)
             if isinstance(command, ArmCommand):
-                outcome = done
-                intent = replace(moved, twist=intent.twist, response=intent.response)
+                outcome = arm_outcome
+                intent = replace(arm_intent, twist=intent.twist, response=intent.response)
             else:
-                intent = replace(intent, joints=moved.joints)
+                intent = replace(intent, joints=arm_intent.joints)
         self._outcome = outcome if command else None
         return intent, outcome
 
     def _begin(self, state: RobotState, body: BodyDescription | None) -> bool:
-        """Begin what the robot does by itself, once, if there was no task and its body can.
+        """Begin the start mission once, if there was no task and the body can carry it out.
 
-        Return False while that has to wait.
+        Return False while it has to wait.
         """
-        if self._started or self._first is None:
+        if self._start_mission_begun or self._start_mission is None:
             return True
         cannot_roam = body is not None and not body.has_base and not self._config.mission
-        self._started = cannot_roam or self._tasks.begin(self._first, state)
-        return self._started
+        begun = cannot_roam or self._tasks.begin(self._start_mission, state)
+        self._start_mission_begun = begun
+        return begun
 
     def _move_arm(
         self, state: RobotState, body: BodyDescription, command: Command | None, idle: Idle
     ) -> StepResult:
-        """Carry out a command for the arm; without one, it holds still."""
-        wanted = command if isinstance(command, ArmCommand) else None
+        """Carry out a command for the arm; without one, the arm holds still."""
+        arm_command = command if isinstance(command, ArmCommand) else None
         number = command.number if command else 0
-        if wanted and number != self._checked:  # before packages are imported that may be missing
+        if arm_command and number != self._checked_number:  # before importing optional packages
             try:
-                arm_steps.check(body, [wanted.do], wanted.things.values())
+                arm_steps.check(body, [arm_command.do], arm_command.things.values())
             except GigabrainError as error:
                 return self._refused(number, str(error))
-            self._checked = number
-        if wanted is None and command and not body.has_base:
+            self._checked_number = number
+        if arm_command is None and command and not body.has_base:
             return self._refused(number, f"{body.robot_type} has no base to drive")
-        needed = self._manipulator is None and (wanted or self._may_hold(body))
-        if needed and self._kernels.arm_loaded():
+        load_arm = self._manipulator is None and (arm_command or self._may_hold(body))
+        if load_arm and self._kernels.arm_loaded():
             from gigabrain_zenoh.decision.manipulator import Manipulator  # imports MuJoCo
 
             self._manipulator = Manipulator(self._bus, self._name, self._tasks.held)
         if self._manipulator is None:
-            if wanted is None:
+            if arm_command is None:
                 return Intent(behaviour=self._name, reason=idle.reason), StepOutcome()
-            text, known = f"waiting: {WaitReason.STARTING}", self._tasks.held
-            outcome = StepOutcome(number=number, activity="waiting", reason=text, holds=known)
+            text, holds = f"waiting: {WaitReason.STARTING}", self._tasks.held
+            outcome = StepOutcome(number=number, activity="waiting", reason=text, holds=holds)
             return Intent(behaviour=self._name, reason=text), outcome
         held, seen = self._source.held(state), self._seen.at(state)
-        intent, outcome = self._manipulator.step(state, body, wanted, idle, held, seen)
+        intent, outcome = self._manipulator.step(state, body, arm_command, idle, held, seen)
         return intent, self._on_map(outcome, state)
 
     def _may_hold(self, body: BodyDescription) -> bool:
-        """Return whether the gripper may hold something since before a restart."""
+        """Return whether the gripper may still hold something that it held before a restart."""
         if self._tasks.held is None:
             return False
         try:
@@ -206,18 +207,18 @@ class GoalServer(InputSource):
         return True
 
     def _on_map(self, outcome: StepOutcome, state: RobotState) -> StepOutcome:
-        """Return an outcome with what to approach in the map, instead of in the body's frame."""
-        near = outcome.approach
-        if near is None:
+        """Return `outcome` with its `approach` moved from the body's frame to the map."""
+        target = outcome.approach
+        if target is None:
             return outcome
         here = self._source.here(state.boot, state.tick)
         if here is None:
             return replace(outcome, approach=None)
-        x, y = to_parent(here, near.x, near.y)
-        return replace(outcome, approach=replace(near, x=x, y=y))
+        x, y = to_parent(here, target.x, target.y)
+        return replace(outcome, approach=replace(target, x=x, y=y))
 
     def _refused(self, number: int, reason: str) -> StepResult:
-        """Return that a command cannot be carried out."""
+        """Return the failure of a command that cannot be carried out."""
         intent = Intent(behaviour=self._name, reason=reason)
         held = self._tasks.held
         return intent, StepOutcome(number=number, state="failed", reason=reason, holds=held)
@@ -232,23 +233,23 @@ class GoalServer(InputSource):
         return self._navigator
 
     def _awaits_map(self, state: RobotState) -> bool:
-        """Return whether perception may still be compiling: then there is no first map."""
+        """Return whether perception may still be compiling, and so has no first map yet."""
         if self._loaded_tick is None:
             self._loaded_tick = state.tick
-        late = state.tick - self._loaded_tick
-        if self._began_late and 0 <= late < FIRST_MAP_TICKS:
-            self._began_late = not self._source.oriented(state)
-            return self._began_late
+        loaded_ticks = state.tick - self._loaded_tick
+        if self._stepped_unloaded and 0 <= loaded_ticks < FIRST_MAP_TICKS:
+            self._stepped_unloaded = not self._source.oriented(state)
+            return self._stepped_unloaded
         return False
 
     def _start_up(
         self, state: RobotState, world: WorldModel | None, verdict: SafetyState | None
     ) -> StepResult:
-        """Roam without a map, if the robot may explore and has no task; else stand.
+        """Roam without a map, if the robot may explore and has no task; else stand still.
 
-        A car stands as well: it cannot turn away on the spot.
+        A car always stands still: it cannot turn on the spot.
         """
-        self._began_late = True
+        self._stepped_unloaded = True
         self._tasks.wait(state)
         body = self._source.body
         car = body is not None and body.turning_radius > 0.0
@@ -267,7 +268,7 @@ class GoalServer(InputSource):
         return self._navigator is not None and self._navigator.hung
 
     async def close(self) -> None:
-        """Close the task server after its last write, then stop all work beside the loop."""
+        """Close the task server after its last write, then stop all worker threads."""
         await self._kernels.close()
         await self._tasks.close()
         if self._navigator:
@@ -276,13 +277,13 @@ class GoalServer(InputSource):
             self._manipulator.close()
 
     async def check(self, goal: Goal | None) -> str:
-        """Return how the robot would reach `goal`, for people; see CheckGoal. Raises Refused."""
+        """Describe how the robot would reach `goal`; see CheckGoal. Raises Refused."""
         body = self._source.body
         if body and not body.has_base:
             raise Refused(f"{body.robot_type} has no base to drive")
         for _ in range(POSE_TIMEOUT_NS // POLL_NS):
-            if (waits := self._waits) or self._navigator is None:
-                return f"accepted; {waits}"
+            if (reason := self._wait_reason) or self._navigator is None:
+                return f"accepted; {reason}"
             if self._navigator.located:
                 break
             await self._bus.clock.sleep_ns(POLL_NS)
@@ -290,12 +291,12 @@ class GoalServer(InputSource):
             raise Refused(self._source.lost or WaitReason.NO_MAP)
         if goal is None:
             return ""
-        found = await self._navigator.check(goal)
-        offset = f"; {found.offset}" if found.offset else ""
-        return f"on the way, {found.length_m:.1f} m{offset}"
+        path = await self._navigator.check(goal)
+        offset = f"; {path.offset}" if path.offset else ""
+        return f"on the way, {path.length_m:.1f} m{offset}"
 
     @property
-    def _waits(self) -> WaitReason | None:
+    def _wait_reason(self) -> WaitReason | None:
         if self._navigator is None or not self._loaded:
             return WaitReason.STARTING
         return self._navigator.waits
@@ -306,8 +307,8 @@ class GoalServer(InputSource):
             await self._bus.clock.sleep_ns(STARTING_STATUS_NS)
 
 
-def _first_mission(config: NavigationConfig) -> StartMission | None:
-    """Return what a robot does by itself. Raises ConfigError."""
+def _start_mission(config: NavigationConfig) -> StartMission | None:
+    """Return the configured start mission, if there is one. Raises ConfigError."""
     if config.mission:
         path = expanded(config.mission)
         return StartMission(*mission_files.load(path), label=path.stem, source=str(path))
@@ -318,9 +319,9 @@ def _first_mission(config: NavigationConfig) -> StartMission | None:
 
 
 def _roaming(config: NavigationConfig) -> AvoidConfig:
-    """Return settings for driving without a map, within the speed limit."""
-    slow = AvoidConfig(turn="clearer")
+    """Return the settings for driving without a map, within the speed limit."""
+    roaming = AvoidConfig(turn="clearer")
     limit = config.max_linear_speed
-    return (
-        slow if limit is None else replace(slow, max_linear_speed=min(slow.max_linear_speed, limit))
-    )
+    if limit is None:
+        return roaming
+    return replace(roaming, max_linear_speed=min(roaming.max_linear_speed, limit))

@@ -26,25 +26,25 @@ NO_BASE = "idle: the body has no base to drive"
 log = logging.getLogger(__name__)
 
 SETTINGS_KEY = "decision.settings"  # place of a behaviour's settings in a deployment file
-RENAMED_PARAMS = {  # by behaviour; removed in 0.3, like the words in config/renames.py
+RENAMED_PARAMS = {  # old to new name, by behaviour; remove in 0.3 together with config/renames.py
     "avoid": {"linear_speed": "max_linear_speed", "angular_speed": "max_angular_speed"},
     "navigate": {"speed_limit": "max_linear_speed"},
 }
 
 
 class InputSource:
-    """Steps a behaviour with its inputs: here the world model and the odometry alone."""
+    """Collects inputs and steps a behaviour: here with world model and odometry only."""
 
     moves_arms = False
 
     async def prepare(self) -> None:
-        """Prepare what must be there before the first step."""
+        """Prepare what the first step needs."""
 
     async def finish_preparing(self) -> None:
-        """Return once everything is prepared that takes long. Raises what fails in it."""
+        """Wait for slow preparations. Raises their errors."""
 
     def configure(self, config: Any) -> None:
-        """Use other settings from now on."""
+        """Replace the settings."""
 
     def observe(self, state: RobotState) -> None:
         """Record a robot state; called with every state."""
@@ -57,7 +57,7 @@ class InputSource:
         verdict: SafetyState | None,
         objects: ObjectsByPerceptor,
     ) -> StepResult:
-        """Step the behaviour once with the present inputs."""
+        """Step the behaviour once with the current inputs."""
         must_charge = battery_nearly_empty(verdict)
         return behaviour.step(
             Inputs(world=world, pose=state.pose, must_charge=must_charge, objects=objects)
@@ -65,17 +65,17 @@ class InputSource:
 
     @property
     def hung(self) -> bool:
-        """Return whether a part of it will never finish, while the rest continues."""
+        """Return whether a worker thread will never finish, although the node still runs."""
         return False
 
     async def close(self) -> None:
-        """Return once everything is written."""
+        """Wait until everything is written."""
 
 
 class DecisionLoop:
-    """Steps the behaviour once per world, and keeps the intent in between.
+    """Steps the behaviour once per world model, and keeps its intent until the next one.
 
-    A world waits for the state of its tick, so that the order of the two does not matter.
+    A world model waits for the state of the same tick, so they can arrive in either order.
     """
 
     def __init__(self, config: DecisionConfig, source: InputSource | None = None) -> None:
@@ -97,7 +97,7 @@ class DecisionLoop:
             bus.params.rename(old, new)
 
     def configure(self, settings: Any) -> None:
-        """Use other settings from now on; the behaviour keeps its memory."""
+        """Replace the settings; the behaviour keeps its memory."""
         self._settings = settings
         self._behaviour.configure(settings)
         self._source.configure(settings)
@@ -109,8 +109,8 @@ class DecisionLoop:
         verdict: SafetyState | None = None,
         objects: ObjectsByPerceptor = NO_OBJECTS,
     ) -> None:
-        """Form a new intent if there is a new world."""
-        if state.boot != self._boot:  # the driver has restarted, and with it the odometry
+        """Update the intent if there is a new world model."""
+        if state.boot != self._boot:  # the driver restarted, and the odometry with it
             self._behaviour, self._boot, self.basis = self._type(self._settings), state.boot, 0
         if world is not None:
             if world.basis == self.basis or world.basis > state.tick:
@@ -125,13 +125,13 @@ class DecisionLoop:
         self.activity = outcome.activity
 
     def rest(self, reason: str) -> None:
-        """Form an intent to do nothing."""
+        """Set the intent to do nothing."""
         self.intent = Intent(behaviour=self._name, reason=reason)
         self.activity = "idle"
 
 
 async def run(config: DecisionConfig, bus: Bus, ready: Callable[[], None]) -> None:
-    """Publish an intent at once for each world, and repeat it at each state."""
+    """Publish a new intent for each world model, and repeat it at each state."""
     source = input_source(config, bus)
     try:
         await source.prepare()
@@ -157,7 +157,7 @@ def input_source(config: DecisionConfig, bus: Bus) -> InputSource:
 
 
 def _serve(config: DecisionConfig, bus: Bus, source: InputSource) -> None:
-    loop, logged, too_old = DecisionLoop(config, source), "", 0
+    loop, logged_activity, late_worlds = DecisionLoop(config, source), "", 0
     loop.serve_params(bus)
     verdicts: PreviousTick[SafetyState] = PreviousTick()
 
@@ -184,16 +184,16 @@ def _serve(config: DecisionConfig, bus: Bus, source: InputSource) -> None:
         publish(state)
 
     def publish(state: RobotState) -> None:
-        nonlocal logged
+        nonlocal logged_activity
         bus.publish(INTENT, loop.intent, basis=loop.basis)
-        if loop.activity != logged:
-            logged, reason = loop.activity, loop.intent.reason
+        if loop.activity != logged_activity:
+            logged_activity, reason = loop.activity, loop.intent.reason
             data = {"event": "decision", "tick": state.tick, "reason": reason}
             log.info("%s", reason, extra={"data": data})
 
     def on_world(world: WorldModel) -> None:
-        nonlocal too_old
-        too_old += newest_world() is None  # received too late, over a slow link
+        nonlocal late_worlds
+        late_worlds += newest_world() is None  # outdated on arrival, after a slow link
         if world.basis <= bus.time.tick:
             decide(world)
 
@@ -205,4 +205,4 @@ def _serve(config: DecisionConfig, bus: Bus, source: InputSource) -> None:
     states = bus.latest(STATE, decide)
     worlds = bus.latest(WORLD, on_world)
     bus.latest(SAFETY, verdicts.receive)
-    bus.progress = Progress(received, lambda: () if source.hung else (loop.basis, too_old))
+    bus.progress = Progress(received, lambda: () if source.hung else (loop.basis, late_worlds))

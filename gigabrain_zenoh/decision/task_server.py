@@ -51,18 +51,18 @@ log = logging.getLogger(__name__)
 
 STATUS_TICKS = 10  # robot/task is published at 5 Hz
 
-# returns how the robot would reach a goal, for people; without a goal, checks only that its pose in
-# the map is known. Raises Refused
+# returns a text that says how the robot would reach a goal; without a goal, only checks that the
+# pose in the map is known. Raises Refused
 CheckGoal = Callable[[Goal | None], Awaitable[str]]
 
 
 class StartMission(NamedTuple):
-    """A mission that a robot begins with by itself."""
+    """A mission that the robot begins by itself after a start."""
 
-    mission: Mission  # without the map's places that it names
+    mission: Mission  # parsed without the places of the map
     text: str
     label: str
-    source: str  # its file, for errors
+    source: str  # file name, for errors
 
 
 class TaskServer:
@@ -86,79 +86,80 @@ class TaskServer:
             log.warning("%s", problem, extra={"data": {"event": "tasks"}})
         self._queue = TaskQueue(self._topics.read, self._scripts.start, saved, self._seek)
         self._writer: BackgroundWriter[Saved] = BackgroundWriter(file.write, 1)
-        self._written: Saved | None = saved  # None after a fault
+        self._written: Saved | None = saved  # None after a failed write
         self._write_fault = Fault(log)
         self._boot = self._tick = self._status_tick = self._basis = 0
         self._logged: set[str] = set()  # tasks whose end was logged
-        # name and count of the map that tasks are for, see Zones
+        # of the map that the tasks belong to: name and `maps_loaded`, see Zones
         self._map = None if saved.maps_loaded is None else (saved.map, saved.maps_loaded)
-        self._from_disk = True  # until the map is known
-        self._waits = ""  # what all tasks wait for, before the first step
+        self._from_disk = True  # `_map` was read from disk, and not compared with the bus yet
+        self._starting_reason = ""  # why tasks wait before the first step; empty afterwards
         bus.serve(GOAL, self._on_goal)
         bus.serve(MISSION, self._on_mission)
         bus.serve(TASK_CHANGE, self._on_change)
 
     def publish_starting(self) -> None:
-        """Publish the status while nothing can drive by a map yet."""
-        self._waits = f"waiting: {WaitReason.STARTING}"
+        """Publish the status before the robot can drive by a map."""
+        self._starting_reason = f"waiting: {WaitReason.STARTING}"
         self._publish()
 
     def wait(self, state: RobotState) -> None:
-        """Publish that status at its rate; called with every step that does not advance tasks."""
+        """Call `publish_starting` at the status rate, in every step that advances no tasks."""
         self._tick = state.tick
         if not 0 <= state.tick - self._status_tick < STATUS_TICKS:
             self.publish_starting()
 
     @property
     def held(self) -> Held | None:
-        """Return what the gripper holds, as far as decision knows."""
+        """Return what the gripper holds; None if that is nothing or unknown."""
         return self._queue.held
 
     def unused(self, boot: int) -> bool:
-        """Return whether there is no task, nor was there one in this start of the driver."""
+        """Return whether there is no task, and was none since this start of the driver."""
         return self._queue.is_unused(boot)
 
     def step(
         self, state: RobotState, outcome: StepOutcome | None, basis: int = 0
     ) -> tuple[Command | None, Idle]:
-        """Advance the queue, with the world of tick `basis`.
+        """Advance the queue, with the world model of tick `basis`.
 
-        Return the next command, and why the robot stands if there is none.
+        Return the next command, and the reason to stand still if there is none.
         """
-        self._waits = ""
+        self._starting_reason = ""
         same_boot = state.boot == self._boot
         seconds = max(0, state.tick - self._tick) * TICK_S if same_boot else 0.0
         self._boot, self._tick, self._basis = state.boot, state.tick, basis
         if not same_boot:
             self._queue.restart(state.boot)
             self._status_tick = 0
-        self._drop_if_moved()
+        self._cancel_if_map_changed()
         self._topics.observe(state)
         self._objects.observe(self._source.body)
-        wanted = self._queue.step(seconds, outcome)
+        command_or_idle = self._queue.step(seconds, outcome)
         if not 0 <= state.tick - self._status_tick < STATUS_TICKS or self._just_ended():
             self._publish()
-        return wanted
+        return command_or_idle
 
-    def _drop_if_moved(self) -> None:
-        """Cancel all tasks if another map was loaded: their coordinates mean other places."""
+    def _cancel_if_map_changed(self) -> None:
+        """Cancel all tasks if another map was loaded: their coordinates are of the old one."""
         loaded = self._zones.maps_loaded(self._boot, self._tick)
         if loaded is None:
             return
         name = self._zones.at(self._boot, self._tick).map
         before, self._map = self._map, (name, loaded)
-        # a map that is saved gets a name, but hardly while decision is restarted
+        # saving also renames a map, but hardly ever while decision restarts
         renamed = before is not None and before[0] != name and self._from_disk
         self._from_disk = False
-        moved = renamed or (before is not None and before[1] != loaded)
-        if moved and self._queue.status.current:
+        changed = renamed or (before is not None and before[1] != loaded)
+        if changed and self._queue.status.current:
             text = self._queue.cancel("all", "loading another map")
             log.warning("%s: another map was loaded", text, extra={"data": {"event": "task"}})
 
     def begin(self, start: StartMission, state: RobotState) -> bool:
-        """Start a mission, unless there were tasks in this start of the driver, or log why not.
+        """Begin a mission, unless there were tasks since this start of the driver.
 
-        Return False while the body, or the map's places that it names, are not known.
+        A mission that is refused is logged. Return False while the body, or the places of the map
+        that the mission names, are unknown.
         """
         now = state.boot, state.tick
         if not self.unused(state.boot):
@@ -166,7 +167,7 @@ class TaskServer:
         if self._source.body is None:
             return False
         try:
-            self._refuse_impossible(start.mission)
+            self._check_feasible(start.mission)
             if any(missions.map_places(start.mission)) and self._zones.maps_loaded(*now) is None:
                 return False
             mission = mission_files.loads(start.text, start.source, self._zones.at(*now).places)
@@ -176,7 +177,7 @@ class TaskServer:
         return True
 
     async def close(self) -> None:
-        """Return once all is written."""
+        """Wait until everything is written."""
         await self._writer.close()
 
     def _just_ended(self) -> bool:
@@ -184,7 +185,7 @@ class TaskServer:
         return bool(done) and done[0].id not in self._logged
 
     def _publish(self) -> None:
-        """Publish the status, and write the queue where it has changed."""
+        """Publish the status, and write the queue to disk if it changed."""
         self._status_tick = self._tick
         status = self._bus.publish(TASK, self._status())
         for task in reversed(status.done):
@@ -202,12 +203,12 @@ class TaskServer:
 
     def _status(self) -> TaskStatus:
         status = self._queue.status
-        if not self._waits or status.current is None or status.current.state != "active":
+        if not self._starting_reason or status.current is None or status.current.state != "active":
             return status
-        return replace(status, current=replace(status.current, reason=self._waits))
+        return replace(status, current=replace(status.current, reason=self._starting_reason))
 
     def _on_written(self, problem: str) -> None:
-        if problem:  # tried again with the next status, as a cancelled task must not come back
+        if problem:  # the next status tries again: a cancelled task must not return after a restart
             self._written = None
             self._write_fault.begin(problem)
         else:
@@ -215,7 +216,7 @@ class TaskServer:
 
     @contextlib.contextmanager
     def _in_one_map(self) -> Iterator[None]:
-        """Raise Refused if another map was loaded during the block: places are others there."""
+        """Raise Refused if another map was loaded during the block."""
         before = self._zones.newest_loaded
         yield
         if before not in (None, self._zones.newest_loaded):
@@ -237,27 +238,30 @@ class TaskServer:
         return GoalReply(ok=True, text=f"{name}: {path}"[:500], goal=name)
 
     def _goal_of(self, request: GoalRequest) -> Goal:
-        """Return the goal that is asked for. Raises Refused for a place that is not there."""
+        """Return the requested goal. Raises Refused for an unknown place."""
         if request.x is None or request.y is None:
-            known = {one.label for one in self._objects.newest.objects}
-            places = {one.name for one in self._zones.newest.places}
-            if request.place in known - places:
+            labels = {known.label for known in self._objects.newest.objects}
+            places = {place.name for place in self._zones.newest.places}
+            if request.place in labels - places:
                 command = f"gigabrain goto --object {request.place}"
                 raise Refused(f"no place is called {request.place!r}; an object is: {command}")
             return self._zones.goal(request.place, request.yaw)
         return Goal(x=request.x, y=request.y, yaw=request.yaw)
 
     async def _find(self, request: GoalRequest) -> tuple[str, str]:
-        """Add a goal before a thing or a tag; return its name and a text. Raises Refused."""
+        """Add a goal in front of an object or a tag.
+
+        Return its name and a text for users. Raises Refused.
+        """
         wanted: Wanted = request.object if request.tag is None else request.tag
-        self._refuse_blind()
+        self._check_cameras()
         await self._check(None)
         known = self._seek(wanted, (), None).target
         at = f"{known.name} is at ({known.x:.2f}, {known.y:.2f})" if known else ""
         name = self._queue.add_find(wanted, request.how, request.source)
         return name, at or f"{named(wanted)} is not known yet; looking for it"
 
-    def _refuse_blind(self) -> None:
+    def _check_cameras(self) -> None:
         """Raise Refused if the body has no cameras to look around with."""
         body = self._source.body
         if body and not body.cameras:
@@ -266,7 +270,7 @@ class TaskServer:
             raise Refused("the robot has no camera but on its arm; finding needs one on its base")
 
     def _seek(self, wanted: Wanted, without: Collection[int], preferred: int | None) -> Sought:
-        """Return what is known of a wanted thing at the present step."""
+        """Return what is known of a wanted object or tag at the current step."""
         boot, tick = self._bus.time.boot, self._bus.time.tick + 1
         if self._basis:
             boot, tick = self._boot, self._basis
@@ -276,13 +280,13 @@ class TaskServer:
     async def _on_mission(self, request: MissionRequest) -> MissionReply:
         label = request.label or "mission"
         try:
-            # a long one takes a tenth of a second to parse, which no scan should wait for
+            # parsing a long mission takes 0.1 s, and would delay a scan
             with self._in_one_map():
                 places = self._zones.newest.places
                 mission = await asyncio.to_thread(
                     mission_files.loads, request.mission, label, places
                 )
-                self._refuse_impossible(mission)
+                self._check_feasible(mission)
                 if mission.drives:
                     await self._check(None)
             name = self._queue.add_mission(mission, label, request.how, request.source)
@@ -292,7 +296,7 @@ class TaskServer:
         self._accept(name, MISSION, request)
         return MissionReply(ok=True, text=f"{name}: {label}"[:500], task=name)
 
-    def _refuse_impossible(self, mission: Mission) -> None:
+    def _check_feasible(self, mission: Mission) -> None:
         """Raise Refused or UnknownName for steps that this robot cannot carry out."""
         body = self._source.body
         if body and mission.drives and not body.has_base:
@@ -300,7 +304,7 @@ class TaskServer:
         for script in mission.scripts:
             self._scripts.path(script)
         if mission.looks:
-            self._refuse_blind()
+            self._check_cameras()
         if body and (actions := mission.arm_actions):
             arm_steps.check(body, actions, mission.things.values())
 
@@ -328,13 +332,13 @@ class TaskServer:
     def _record(
         self, service: Service[Any, Any], request: GoalRequest | MissionRequest | TaskRequest
     ) -> None:
-        """Publish when a request takes effect, so that a recording can be replayed."""
+        """Publish that a request takes effect now, so that a recording can be replayed."""
         log_accepted(self._bus, service.key, request, self._basis)
         self._publish()
 
 
 class TopicCache:
-    """The newest message of each topic that conditions read, as of before the present tick."""
+    """Newest messages before the current tick, of topics that conditions read."""
 
     def __init__(self, bus: Bus) -> None:
         self._bus = bus
@@ -342,11 +346,11 @@ class TopicCache:
         self._state: RobotState | None = None
 
     def observe(self, state: RobotState) -> None:
-        """Record the present state."""
+        """Record the current state."""
         self._state = state
 
     def read(self, topic: Topic[Any]) -> Message | None:
-        """Return the newest message while it is fresh; the first call subscribes."""
+        """Return the newest message if it is fresh; the first call subscribes."""
         state = self._state
         if state is None or topic.key == STATE.key:
             return state
