@@ -1,6 +1,6 @@
-"""The navigator: owns map, route and local planner, and carries out one drive command per scan.
+"""The navigator: carries out drive commands with a route planner and a local planner.
 
-The import takes long; until it is done, `task_server` already serves goals.
+The import is slow; meanwhile `task_server` already serves goals.
 """
 
 import asyncio
@@ -49,11 +49,11 @@ from gigabrain_zenoh.navigation.local_planner import DEFAULTS, LocalSettings
 from gigabrain_zenoh.navigation.warm_up import warm_up_local_planner
 from gigabrain_zenoh.navigation.zones import NO_ZONES, SpeedCap, ZoneMap
 
-EXACT_M = 0.05  # from where an arm needs the body
-SLOWLY_M = 0.25  # from there on
-BAR_STEP_M = 0.02  # between points of a bar: no gap in the planner's cells
-MAX_SCAN_AGE_TICKS = 10  # of a scan to drive by
-MAX_NEAR_OVER_M = 0.25  # beyond, the clearance within reach of the local planner costs alike
+EXACT_M = 0.05  # position tolerance of the body for work of the arm
+CLOSE_UP_M = 0.25  # from the goal, where `close_up` slows the body
+BAR_STEP_M = 0.02  # between points of a bar, which leaves no gap in the planner's cells
+MAX_SCAN_AGE_TICKS = 10  # while driving
+MAX_NEAR_OVER_M = 0.25  # a larger value makes all clearances in the window cost the same
 NO_ROUTE = Idle("waiting", "waiting: for a path through the map")
 
 ANY_BODY = BodyDescription(
@@ -76,19 +76,20 @@ class Navigator:
         zones: ZoneSource,
     ) -> None:
         self._bus, self._config, self._behaviour = bus, config, behaviour
-        self._source, self._zones = source, zones  # its owner feeds the source with states
-        self._zone_map, self._zoned = NO_ZONES, tuple[Zone, ...]()  # and the zones in that map
+        self._source, self._zones = source, zones  # the owner passes states to the source
+        self._zone_map, self._mapped_zones = NO_ZONES, tuple[Zone, ...]()
         self._routes = RouteSchedule(config, bus)
         self._context: NavigationContext | None = None
         self._boot = 0
-        self._seen = False  # a plausible scan has come since the start
-        self._oriented = False  # pose and map have both been known since the start
-        self._number, self._longest_m = 0, 0.0  # of the present command; progress is a share of it
+        self._got_scan = False  # at least one plausible scan was received
+        self._oriented = False  # pose and map were known together at least once
+        self._number = 0  # of the current command
+        self._longest_m = 0.0  # longest remaining path of this command, for its progress
         self._local: local_planner.LocalPlanner | None = None
         self._body: BodyDescription | None = None
 
     def configure(self, config: NavigationConfig) -> None:
-        """Use other settings; what the local planner has seen and planned is kept."""
+        """Replace the settings; the local planner keeps its memory."""
         self._config, self._routes.inflation = config, config.inflation
         if self._local and self._body:
             self._local.configure(self._body, _local_settings(config, self._body))
@@ -96,28 +97,31 @@ class Navigator:
     def at_scan(
         self, state: RobotState, world: WorldModel | None, verdict: SafetyState | None
     ) -> NavigationContext:
-        """Collect the inputs of the next step, and take a route that is due."""
-        if state.boot != self._boot:  # the driver has restarted, and with it the odometry
+        """Collect the inputs of the next step, and install a route that is due."""
+        if state.boot != self._boot:  # the driver restarted, and the odometry with it
             self._boot, self._local, self._number = state.boot, None, 0
         if world:
-            self._seen = self._seen or world.scan_ok
+            self._got_scan = self._got_scan or world.scan_ok
             self._routes.at_scan()
         self._context = context = self._source.at_scan(state, world, verdict)
         self._routes.count_held(state.boot, context.tick, context.held)
-        if context.zones is not self._zoned and context.zones != self._zoned:
+        if context.zones is not self._mapped_zones and context.zones != self._mapped_zones:
             self._zone_map = ZoneMap(context.zones)
-        self._zoned = context.zones
+        self._mapped_zones = context.zones
         return context
 
     def drive(self, command: DriveCommand | None, idle: Idle) -> StepResult:
-        """Carry out `command` for one scan, or stand as `idle`; once after each `at_scan`."""
+        """Carry out `command` for one scan, or stand still as `idle` says.
+
+        Call it once after each `at_scan`.
+        """
         context = self._context
         assert context
         route = self._update_route(context, command)
-        why_not = _why_not(context, command)
-        if why_not or command is None or route is None or route.number != command.number:
+        waiting = _reason_to_wait(context, command)
+        if waiting or command is None or route is None or route.number != command.number:
             self._routes.report(None)
-            return self._stand(command, why_not or (NO_ROUTE if command else idle))
+            return self._stand(command, waiting or (NO_ROUTE if command else idle))
         if command.number != self._number:
             self._number, self._longest_m = command.number, 0.0
         if route.goal is None or route.points is None:
@@ -141,13 +145,13 @@ class Navigator:
 
     @property
     def waits(self) -> WaitReason | None:
-        """Return what start-up waits for; None once pose and map were known."""
+        """Return what the start-up waits for; None once pose and map were known."""
         if self._oriented:
             return None
-        if not self._seen:
+        if not self._got_scan:
             return WaitReason.PERCEPTION_STARTING
-        why = self._source.lost
-        return None if why is WaitReason.NO_LOCALIZATION else why or WaitReason.NO_MAP
+        lost = self._source.lost
+        return None if lost is WaitReason.NO_LOCALIZATION else lost or WaitReason.NO_MAP
 
     @property
     def lost(self) -> WaitReason:
@@ -161,12 +165,12 @@ class Navigator:
         body, here = self._source.body, self._context.here if self._context else None
         if grid is None or body is None or here is None:
             raise Refused(self.lost)
-        # a second planner, as the first may be planning in the worker thread
+        # a separate planner: the other one may be planning in the worker thread
         routes = RoutePlanner(self._config.unknown_space)
-        found = await asyncio.to_thread(routes.check, grid, body, here, goal, zones)
-        if isinstance(found, Unreachable):
-            raise Refused(found.reason)
-        return found
+        result = await asyncio.to_thread(routes.check, grid, body, here, goal, zones)
+        if isinstance(result, Unreachable):
+            raise Refused(result.reason)
+        return result
 
     def _update_route(
         self, context: NavigationContext, command: DriveCommand | None
@@ -180,10 +184,10 @@ class Navigator:
                 self._routes.request(context, here, command, grid, self._zone_map)
         return self._routes.route
 
-    def _stand(self, command: DriveCommand | None, why: Idle) -> StepResult:
-        reason = why.reason[:500]
+    def _stand(self, command: DriveCommand | None, idle: Idle) -> StepResult:
+        reason = idle.reason[:500]
         number = command.number if command else 0
-        outcome = StepOutcome(number=number, activity=why.activity, reason=reason)
+        outcome = StepOutcome(number=number, activity=idle.activity, reason=reason)
         return self._intent(reason=reason), outcome
 
     def _without_path(
@@ -206,11 +210,11 @@ class Navigator:
         goal: Goal,
         points: Floats,
     ) -> StepResult:
-        """Drive along a route that leads to its goal."""
+        """Follow `points`, the path of `route` to `goal`, with the local planner."""
         assert context.map_from_odom
         assert context.body
         here = compose(context.map_from_odom, context.pose)
-        left = _rest_of(points, here)
+        left = _remaining_path(points, here)
         cap = self._speed_cap(context, here, left)
         request = self._request(context, here, route, goal, points, left, cap)
         if command.target and command.target.away is not None:
@@ -248,9 +252,9 @@ class Navigator:
         left: Floats,
         cap: SpeedCap | None,
     ) -> local_planner.PlanRequest:
-        """Return what the local planner needs, in the odometry's frame.
+        """Return the request to the local planner, in the odometry frame.
 
-        `here`, and the `points` of a path and those `left` of it (k, 2), are in the map's.
+        `here`, the path's `points` (n, 2) and the remaining ones `left` (k, 2) are in the map.
         """
         assert context.map_from_odom
         assert context.world
@@ -259,35 +263,35 @@ class Navigator:
         around = here.x, here.y, DEFAULTS.window
         keepouts = self._zone_map.keepouts_near(*around)
         lanes = self._zone_map.lanes_beside(*around, left[1:])
-        there = compose(to_odom, Pose(x=goal.x, y=goal.y, yaw=goal.yaw or 0.0))
+        end = compose(to_odom, Pose(x=goal.x, y=goal.y, yaw=goal.yaw or 0.0))
         headings = route.headings
         return local_planner.PlanRequest(
             tick=context.tick,
             pose=context.pose,
             velocity=context.velocity,
-            goal=Goal(x=there.x, y=there.y, yaw=None if goal.yaw is None else there.yaw),
+            goal=Goal(x=end.x, y=end.y, yaw=None if goal.yaw is None else end.yaw),
             hits=context.world.points().astype(np.float64),
             path=transform(move, points),
             headings=None if headings is None else headings + np.array((to_odom.yaw, 0.0)),
             obstacles=context.world.obstacles,
             contours=placed(context.world.contours, context.pose),
-            cameras=tuple(one.name for one in context.world.cameras if one.ok),
+            cameras=tuple(camera.name for camera in context.world.cameras if camera.ok),
             response=context.actuation,
             sent=context.sent,
             delayed=context.delayed_s,
             may_back=context.may_reverse,
-            keepouts=tuple(transform(move, one) for one in keepouts),
-            avoid=tuple(transform(move, one) for one in lanes),
+            keepouts=tuple(transform(move, polygon) for polygon in keepouts),
+            avoid=tuple(transform(move, polygon) for polygon in lanes),
             max_speed=cap.speed if cap else None,
         )
 
     def _slowed(self, context: NavigationContext, cap: SpeedCap | None) -> str:
-        """Return what makes the robot slower, as the end of a text."""
+        """Return what slows the robot, to be appended to a reason."""
         late_s = context.delayed_s
-        slow = f"; slower: this host is late by {late_s:.2f} s" if late_s else ""
-        if cap and cap.speed < self._fastest(context):
-            slow += f"; at most {cap.speed:.2f} m/s: speed zone {cap.zone!r}"
-        return slow
+        text = f"; slower: this host is late by {late_s:.2f} s" if late_s else ""
+        if cap and cap.speed < self._max_speed(context):
+            text += f"; at most {cap.speed:.2f} m/s: speed zone {cap.zone!r}"
+        return text
 
     def _outcome(
         self,
@@ -304,7 +308,7 @@ class Navigator:
         distance_m = float(np.hypot(*np.diff(left, axis=0).T).sum())
         self._longest_m = max(self._longest_m, distance_m, 1e-6)
         arrived = plan.arrived and command.kind != "explore" and not route.activity
-        speed = self._fastest(context)
+        speed = self._max_speed(context)
         place = describe_goal(route.goal)
         driving = "exploring" if command.kind == "explore" else f"going to {place}"
         at = f"at {place}, {route.reason}" if route.reason else f"at {place}"
@@ -323,7 +327,7 @@ class Navigator:
             heading_error=heading_error,
         )
 
-    def _fastest(self, context: NavigationContext) -> float:
+    def _max_speed(self, context: NavigationContext) -> float:
         assert context.body
         return min(self._config.max_linear_speed or math.inf, context.body.max_linear_speed)
 
@@ -354,33 +358,33 @@ class Navigator:
         return Intent(twist=twist, behaviour=self._behaviour, reason=reason, **more)
 
 
-def _why_not(context: NavigationContext, command: DriveCommand | None) -> Idle | None:
-    """Return why the robot must not drive now, whatever is wanted."""
+def _reason_to_wait(context: NavigationContext, command: DriveCommand | None) -> Idle | None:
+    """Return why the robot must not drive now; None if it may."""
     if context.must_charge:
         return Idle("resting", "resting: the battery is nearly empty; charge it")
-    why = ""
+    reason = ""
     if context.world is None:
-        why = "perception is silent"
+        reason = "perception is silent"
     elif not context.world.scan_ok:
-        why = context.world.scan_problem
+        reason = context.world.scan_problem
     elif context.body is None:
-        why = "no robot/body from the driver yet"
+        reason = "no robot/body from the driver yet"
     elif context.lost and command is not None:
-        why = context.lost
+        reason = context.lost
     elif context.late_ticks > MAX_SCAN_AGE_TICKS:
         late_s = context.late_ticks * TICK_S
-        why = f"this host is too busy: its newest scan is {late_s:.2f} s old"
-    return Idle("waiting", f"waiting: {why}") if why else None
+        reason = f"this host is too busy: its newest scan is {late_s:.2f} s old"
+    return Idle("waiting", f"waiting: {reason}") if reason else None
 
 
 def _local_settings(config: NavigationConfig, body: BodyDescription) -> LocalSettings:
-    usual = inflation(body).decay
-    wanted = inflation(body, beyond=config.inflation).decay
+    default = inflation(body).decay
+    configured = inflation(body, beyond=config.inflation).decay
     return LocalSettings(
         linear_speed=config.max_linear_speed,
         samples=config.samples,
         aggressiveness=config.aggressiveness,
-        near_over=min(DEFAULTS.near_over * wanted / usual, MAX_NEAR_OVER_M),
+        near_over=min(DEFAULTS.near_over * configured / default, MAX_NEAR_OVER_M),
     )
 
 
@@ -391,57 +395,57 @@ def _same_shape(one: BodyDescription, other: BodyDescription) -> bool:
 def close_up(
     request: local_planner.PlanRequest, body: BodyDescription
 ) -> local_planner.PlanRequest:
-    """Return a request to stand exactly at its goal, which is just before a thing.
+    """Return a request to stop exactly at a goal right before a thing.
 
-    There the body drives so slowly that its stop zone ends well within EXACT_M of the goal: once
-    safety has stopped it, it may not go on until the zone is free again.
+    Near the goal the body drives so slowly that its stop zone reaches only a third of EXACT_M ahead
+    of its margin. Else safety would stop it short of the goal until the zone is free again.
     """
-    off = math.hypot(request.goal.x - request.pose.x, request.goal.y - request.pose.y)
-    slow = request.max_speed
-    if off < SLOWLY_M:
-        stops = brakes(body)["forward"].speed(body.thresholds.stop_margin + EXACT_M / 3)
-        slow = min(stops, slow or math.inf)
-    return dataclasses.replace(request, tolerance=EXACT_M, max_speed=slow)
+    distance = math.hypot(request.goal.x - request.pose.x, request.goal.y - request.pose.y)
+    max_speed = request.max_speed
+    if distance < CLOSE_UP_M:
+        safe_speed = brakes(body)["forward"].speed(body.thresholds.stop_margin + EXACT_M / 3)
+        max_speed = min(safe_speed, max_speed or math.inf)
+    return dataclasses.replace(request, tolerance=EXACT_M, max_speed=max_speed)
 
 
 def barred(request: local_planner.PlanRequest, body: BodyDescription) -> local_planner.PlanRequest:
-    """Return a request with a bar before the body, which it has to back off or turn away from.
+    """Return a request with a bar of obstacles in front of the body, so that it drives elsewhere.
 
-    Safety stops it there for something that decision does not know of, such as the place of a thing
-    that an arm has taken away, so near that no camera shows that it is gone.
+    Safety stops the body for something that decision does not know. For example, an arm took a
+    thing away, and its place is too near for any camera to show that the thing is gone.
     """
     corners = np.array(body.footprint)
     x = float(corners[:, 0].max()) + body.thresholds.stop_margin
     left, right = float(corners[:, 1].max()), float(corners[:, 1].min())
-    aside = np.linspace(right, left, math.ceil((left - right) / BAR_STEP_M) + 1)
-    bar = transform(from_pose(request.pose), np.column_stack((np.full_like(aside, x), aside)))
+    y = np.linspace(right, left, math.ceil((left - right) / BAR_STEP_M) + 1)
+    bar = transform(from_pose(request.pose), np.column_stack((np.full_like(y, x), y)))
     return dataclasses.replace(request, known=np.concatenate((request.known, bar)))
 
 
 def _errors(command: DriveCommand, here: Pose) -> tuple[float | None, float | None]:
-    """Return the distance to the goal [m] and the heading error there [rad], if it has them."""
+    """Return the distance to the goal [m] and the heading error [rad]; None if it has none."""
     goal = command.goal
     if goal is None:
         return None, None
-    turned = None if goal.yaw is None else abs(math.remainder(goal.yaw - here.yaw, math.tau))
-    return math.hypot(goal.x - here.x, goal.y - here.y), turned
+    heading = None if goal.yaw is None else abs(math.remainder(goal.yaw - here.yaw, math.tau))
+    return math.hypot(goal.x - here.x, goal.y - here.y), heading
 
 
-def _rest_of(points: Floats, here: Pose) -> Floats:
-    """Return the part of a path that is left, (k, 2), with at least two points."""
+def _remaining_path(points: Floats, here: Pose) -> Floats:
+    """Return the rest of a path (k, 2) [m] from `here` on, with k >= 2."""
     nearest = int(np.argmin(np.hypot(points[:, 0] - here.x, points[:, 1] - here.y)))
     rest = points[nearest + 1 :] if nearest + 1 < len(points) else points[-1:]
     return np.vstack(((here.x, here.y), rest))
 
 
 def _thinned(points: Floats) -> tuple[tuple[float, float], ...]:
-    """Return few enough points to be drawn, with the first and the last."""
+    """Return at most MAX_POINTS of a path, with the first and the last, to be drawn."""
     if len(points) > MAX_POINTS:
         points = points[np.linspace(0, len(points) - 1, MAX_POINTS).round().astype(int)]
     return tuple(map(tuple, points.round(3).tolist()))
 
 
 def warm_up() -> None:
-    """Call every kernel that all bodies need for planning and driving, so that it is compiled."""
+    """Compile all kernels that every body needs for planning and driving, by calling them."""
     global_planner.warm_up()
     warm_up_local_planner(ANY_BODY)

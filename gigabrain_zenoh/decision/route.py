@@ -33,18 +33,18 @@ from gigabrain_zenoh.navigation.zones import NO_ZONES, ZoneMap
 
 GIVE_UP_TICKS = 1500  # 30 s of driving without progress
 NO_PROGRESS = "no progress for 30 s"
-LEAVE_FRONTIER_TICKS = 500  # 10 s without progress towards a frontier or a visited place
-BLOCKED_MEMORY_TICKS = 500  # 10 s, for which a plan avoids what blocked the last route
-FRONTIER_HYSTERESIS_M = 1.5  # switch frontiers only for a gain of this much
+LEAVE_FRONTIER_TICKS = 500  # 10 s without progress towards a frontier or a place to look from
+BLOCKED_MEMORY_TICKS = 500  # plans avoid for 10 s the hits that blocked a route
+FRONTIER_HYSTERESIS_M = 1.5  # minimum gain for another frontier
 SAME_FRONTIER_M = 0.6  # a frontier moves as the map grows
 FRONTIER_CONFIRM_TICKS = 125  # 2.5 s: the map is published once a second
 ARRIVED_M = LocalSettings().position_tolerance
-NEAR_GOAL_M = 0.25  # good enough for a goal that was free when it was requested: maps shift
-OCCUPIED_TICKS = 500  # 10 s without progress towards an occupied goal,
-STANDING_TICKS = 250  # and 5 s where somebody stands who has walked
+NEAR_GOAL_M = 0.25  # tolerance for a goal that was free when it was requested: maps shift
+OCCUPIED_TICKS = 500  # give way after 10 s without progress towards an occupied goal,
+STANDING_TICKS = 250  # or after 5 s near a person who walked there and stands
 
 WAY_OPENS_TICKS = 500  # wait 10 s for people to clear the way before giving up
-LOOKING = "looking around"  # what a robot does that searches
+LOOKING = "looking around"  # activity of a search
 
 Point = tuple[float, float]
 
@@ -57,10 +57,10 @@ class Route:
     version: int  # changes with the destination
     goal: Goal | None = None
     points: Floats | None = None  # (n, 2) [m] in the map
-    headings: Floats | None = None  # (n, 2), of a car, see navigation.global_planner.Path
+    headings: Floats | None = None  # (n, 2), only for cars, see navigation.global_planner.Path
     state: Literal["running", "done", "failed"] = "running"
-    reason: str = ""  # for people
-    activity: str = ""  # of a temporary destination, at which the command is not done
+    reason: str = ""  # shown to users
+    activity: str = ""  # set if the destination is temporary: the command is not done there
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -70,7 +70,7 @@ class RouteFeedback:
     version: int
     arrived: bool = False
     blocked: bool = False  # another route is needed
-    reason: str = ""  # what the local planner did, for people
+    reason: str = ""  # what the local planner did, shown to users
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -88,30 +88,30 @@ class RouteRequest:
     walkers: Floats = field(default_factory=lambda: np.empty((0, 3)))  # see give_way.Walkers
     zones: ZoneMap = NO_ZONES
     inflation: float | None = None  # [m], see NavigationConfig
-    held_ticks: int = 0  # since the last route, in which the body could not follow it
-    slowed_by: str = ""  # causes that safety reports, for people
+    held_ticks: int = 0  # time since the last request in which the body could not follow a route
+    slowed_by: str = ""  # causes that safety reports, shown to users
 
 
 @dataclass(frozen=True, kw_only=True)
 class PathCheck:
-    """Length of the path to a goal [m], and why it ends elsewhere, if it does."""
+    """Length of the path to a goal [m], and why the path ends elsewhere; empty if it does not."""
 
     length_m: float
     offset: str = ""
 
 
 class RoutePlanner:
-    """Plans routes for one command after the other. Not thread-safe."""
+    """Plans routes for one command after another. Not thread-safe."""
 
     def __init__(self, unknown_space: Unknown = "avoid") -> None:
         self._planner, self._unknown_space = PathPlanner(), unknown_space
         self._costmap: Costmap | None = None
-        self._bare: Costmap | None = None  # the same without zones
+        self._bare: Costmap | None = None  # `_costmap` without zones
         self._costmap_key: tuple[object, ...] = ()
         self._overlay: ZoneOverlay | None = None
         self._overlay_key: tuple[object, ...] = ()
         self._zones = NO_ZONES
-        self._rezoned = False  # the zones have changed since the last plan
+        self._zones_changed = False  # since the last plan
         self._blocking: Floats = np.empty((0, 2))  # hits that blocked a route
         self._blocking_tick = 0
         self._contours = ContourMemory()
@@ -120,8 +120,8 @@ class RoutePlanner:
         self._reset(0, 0)
 
     def plan(self, request: RouteRequest) -> Route:
-        """Return the route for a command, from the robot's place."""
-        restarted = request.tick < self._last_tick  # of the driver
+        """Return the route for a command from the robot's current place."""
+        restarted = request.tick < self._last_tick  # the driver
         command = request.command
         if restarted:
             self._contours.forget()
@@ -178,31 +178,31 @@ class RoutePlanner:
         self._path: Path | None = None
         self._last_path: Path | None = None  # the last path to this goal that was found
         self._goal: Goal | None = None
-        self._settled: tuple[Goal, str] | None = None  # where it stays near its goal, and why
-        self._visited: list[Point] = []  # frontiers where it has been,
-        self._missed: list[Point] = []  # and to which it did not get
-        self._doing = ""  # what the local planner did last, for people
+        self._settled: tuple[Goal, str] | None = None  # place accepted near the goal, and why
+        self._visited: list[Point] = []  # frontiers that were reached
+        self._missed: list[Point] = []  # frontiers that were given up
+        self._local_reason = ""  # of the local planner, shown to users
         self._progress, self._last_tick = ProgressMonitor(tick), tick
         self._last_frontier_tick = tick
         self._version += 1
         self._give_way = GiveWay()
 
     def _update(self, request: RouteRequest) -> None:
-        """Record how the last route was driven."""
+        """Record how the last route was followed."""
         feedback = request.feedback
-        passed, self._last_tick = max(0, request.tick - self._last_tick), request.tick
-        self._progress.hold(min(request.held_ticks, passed))
-        self._rezoned = request.zones is not self._zones
-        if self._rezoned:  # what was planned without them does not count any more
+        elapsed_ticks, self._last_tick = max(0, request.tick - self._last_tick), request.tick
+        self._progress.hold(min(request.held_ticks, elapsed_ticks))
+        self._zones_changed = request.zones is not self._zones
+        if self._zones_changed:  # old paths may lead through new zones
             self._zones, self._path, self._last_path = request.zones, None, None
-        self._doing = feedback.reason if feedback else self._doing
+        self._local_reason = feedback.reason if feedback else self._local_reason
         if feedback and feedback.blocked and feedback.version == self._version:
             self._blocking, self._blocking_tick = request.seen, request.tick
         elif request.tick - self._blocking_tick > BLOCKED_MEMORY_TICKS:
             self._blocking = np.empty((0, 2))
 
     def _arrived(self, request: RouteRequest) -> bool:
-        """Return whether the robot has arrived by the present route, not by an older one."""
+        """Return whether the robot arrived by the current route, not by an older one."""
         feedback = request.feedback
         return feedback is not None and feedback.arrived and feedback.version == self._version
 
@@ -210,8 +210,8 @@ class RoutePlanner:
         blocked = self._blocking_tick if len(self._blocking) else 0
         seen = self._contours.version
         key = (request.grid, request.body, blocked, seen, request.inflation, request.zones)
-        known = self._costmap_key
-        same = known and all(a is b or a == b for a, b in zip(key, known, strict=True))
+        old_key = self._costmap_key
+        same = old_key and all(a is b or a == b for a, b in zip(key, old_key, strict=True))
         if self._costmap is None or not same:
             rules = inflation(request.body, self._unknown_space, request.inflation)
             points = np.concatenate((self._blocking, self._contours.points))
@@ -221,7 +221,7 @@ class RoutePlanner:
         return self._costmap
 
     def _zone_overlay(self, request: RouteRequest, bare: Costmap) -> ZoneOverlay | None:
-        """Return the overlay of the zones; it is computed when they or the grid's edges change."""
+        """Return the overlay of the zones, cached until they or the grid's bounds change."""
         shape = (bare.resolution, bare.origin_x, bare.origin_y, bare.cost.shape)
         key = (request.zones, bare.inflation, *shape)
         if key != self._overlay_key:
@@ -233,23 +233,23 @@ class RoutePlanner:
         first, requested = self._goal is None, goal
         goal, offset = self._settled or (goal, "")
         found = self._find(goal, request, costs)
-        away = None if first else self._giving_way(goal, request, costs)
-        if away:
-            return away
-        near = ARRIVED_M if first else NEAR_GOAL_M
-        if isinstance(found, Unreachable) and found.nearest and found.distance <= near:
+        aside = None if first else self._move_aside(goal, request, costs)
+        if aside:
+            return aside
+        tolerance = ARRIVED_M if first else NEAR_GOAL_M
+        if isinstance(found, Unreachable) and found.nearest and found.distance <= tolerance:
             offset = _offset(found)
             goal = Goal(x=found.nearest[0], y=found.nearest[1], yaw=goal.yaw)
             found = self._planner.plan(costs, request.body, request.here, goal)
         if isinstance(found, Unreachable):
             assert self._bare
-            around = self._zones, self._bare, request.body, request.here
-            why = explained(found, *around, goal)
-            closed = self._rezoned and why is not found
-            opens = found.fault == NO_WAY or len(self._contours.points) > 0  # or may go away
-            if (first and not opens) or closed or self._progress.stuck(request.tick, GIVE_UP_TICKS):
+            why = explained(found, self._zones, self._bare, request.body, request.here, goal)
+            closed_by_zone = self._zones_changed and why is not found
+            may_open = found.fault == NO_WAY or len(self._contours.points) > 0  # seen things move
+            stuck = self._progress.stuck(request.tick, GIVE_UP_TICKS)
+            if (first and not may_open) or closed_by_zone or stuck:
                 return self._route(state="failed", reason=why.reason)
-            if self._last_path:  # noise closes narrow ways in the map; the scan shows them
+            if self._last_path:  # noise in the map closes narrow ways that the scan shows open
                 return self._go(goal, self._last_path)
             return self._approach(found, request, costs)
         self._last_path = found
@@ -257,29 +257,29 @@ class RoutePlanner:
         if self._progress.stuck(request.tick, GIVE_UP_TICKS):
             if not self._settle(requested, request):
                 left = f"{found.remaining[0]:.2f} m from the goal"
-                reason = f"gave up: {NO_PROGRESS}, {left}{self._why(request)}"
+                reason = f"gave up: {NO_PROGRESS}, {left}{self._why_slow(request)}"
                 return self._route(state="failed", reason=reason)
             return self._to_goal(requested, request, costs)
         return self._go(goal, found, offset)
 
     def _settle(self, goal: Goal, request: RouteRequest) -> bool:
-        """Accept the present place as the goal, if it is near enough; return whether it is."""
+        """Accept the current place as the goal if it is near enough; return whether it is."""
         x, y = request.here.x, request.here.y
-        off = math.hypot(goal.x - x, goal.y - y)
-        if self._settled or not AT_GOAL_M < off <= NEAR_GOAL_M:
+        distance = math.hypot(goal.x - x, goal.y - y)
+        if self._settled or not AT_GOAL_M < distance <= NEAR_GOAL_M:
             return False
-        why = f"{off:.2f} m from the requested goal: {NO_PROGRESS}{self._why(request)}"
+        why = f"{distance:.2f} m from the requested goal: {NO_PROGRESS}{self._why_slow(request)}"
         self._settled = Goal(x=x, y=y, yaw=goal.yaw), why
         self._progress = ProgressMonitor(request.tick)
         self._version += 1
         return True
 
-    def _why(self, request: RouteRequest) -> str:
-        why = request.slowed_by or self._doing
+    def _why_slow(self, request: RouteRequest) -> str:
+        why = request.slowed_by or self._local_reason
         return f" ({why})" if why else ""
 
-    def _giving_way(self, goal: Goal | None, request: RouteRequest, costs: Costmap) -> Route | None:
-        """Return a route away from who is at the goal or in the way, if the robot gives way."""
+    def _move_aside(self, goal: Goal | None, request: RouteRequest, costs: Costmap) -> Route | None:
+        """Return a route away from a person at the goal or in the way, if the robot gives way."""
         here = request.here.x, request.here.y
         give_way, search = self._give_way, self._planner.search
         if give_way.place and give_way.left:
@@ -303,7 +303,7 @@ class RoutePlanner:
         return self._go(place, way, why, "giving way")
 
     def _approach(self, found: Unreachable, request: RouteRequest, costs: Costmap) -> Route:
-        """Return a route to the nearest reachable place, to see whether the goal is free again."""
+        """Return a route to the nearest reachable place, to check if the goal is free again."""
         place = Goal(x=found.nearest[0], y=found.nearest[1]) if found.nearest else None
         way = self._planner.plan(costs, request.body, request.here, place) if place else None
         if place is None or not isinstance(way, Path):
@@ -335,12 +335,12 @@ class RoutePlanner:
         return self._route(reason="no path to unexplored space")
 
     def _to_target(self, target: Target, request: RouteRequest, costs: Costmap) -> Route:
-        """Return a route before a thing or a tag."""
+        """Return a route to a place in front of an object or a tag."""
         around = costs, request.body, request.here
         goal = self._goal or place_before(*around, target, self._planner.search)
         if goal is None:
-            if away := self._giving_way(None, request, costs):
-                return away
+            if aside := self._move_aside(None, request, costs):
+                return aside
             reason = f"no free and reachable place before {target.name}"
             ended = self._progress.stuck(request.tick, WAY_OPENS_TICKS)
             return self._route(state="failed" if ended else "running", reason=reason)
@@ -349,17 +349,17 @@ class RoutePlanner:
         return replace(route, reason=f"{before}, {route.reason}" if route.reason else before)
 
     def _look(self, request: RouteRequest, costs: Costmap) -> Route:
-        """Return a route to where unseen places can be looked at, or to unexplored space."""
+        """Return a route to a place from where unseen space is visible, or to a frontier."""
         if request.command.seek != self._looks.seek:
             self._looks = LookAround(request.command.seek, request.tick)
         looks, around = self._looks, (costs, request.body, request.here)
-        there = looks.goal is not None and self._goal == looks.goal
+        on_the_way = looks.goal is not None and self._goal == looks.goal
         looks.look(*around, request.tick)
         arrived = self._arrived(request)
         stuck = self._progress.stuck(request.tick, LEAVE_FRONTIER_TICKS)
-        if there and looks.goal and (arrived or stuck):
+        if on_the_way and looks.goal and (arrived or stuck):
             looks.give_up()
-        if there and looks.goal is None:
+        if on_the_way and looks.goal is None:
             self._drop_frontier(request.tick)
         while goal := looks.next_goal(*around, self._planner.search):
             if self._goal not in (None, goal):
@@ -383,9 +383,9 @@ class RoutePlanner:
             return self._route(reason="looking at all again, from nearer by")
         if looks.ended_tick is None:
             looks.ended_tick = request.tick
-        if away := self._giving_way(None, request, costs):
+        if aside := self._move_aside(None, request, costs):
             looks.ended_tick = request.tick
-            return away
+            return aside
         if request.tick - looks.ended_tick < WAY_OPENS_TICKS:
             return self._route(reason="everything reachable was looked at; waiting for other ways")
         if self._missed and looks.try_again():
@@ -394,7 +394,7 @@ class RoutePlanner:
         return replace(route, reason="everything reachable was looked at")
 
     def _explored(self, request: RouteRequest, costs: Costmap) -> Route:
-        """End the exploration, once the map has been updated without a new frontier."""
+        """End the exploration once updates of the map bring no new frontier."""
         cell = costs.cell(request.here.x, request.here.y)
         if cell is None or costs.cells[cell] < 0:
             return self._route(reason="the robot is outside the map")
@@ -403,17 +403,17 @@ class RoutePlanner:
         return self._route(state="done", reason="everything reachable is explored")
 
     def _frontier(self, costs: Costmap, here: Point) -> Goal | None:
-        """Return the best frontier; the present one, unless another is much better."""
+        """Return the best frontier, but keep the current one unless another is much better."""
         found = frontiers(costs, here, (*self._visited, *self._missed), self._planner.search)
         if not found:
             return None
-        best = min(found, key=lambda one: one.score)
+        best = min(found, key=lambda frontier: frontier.score)
         if self._goal:
             x, y = self._goal.x, self._goal.y
-            same = min(found, key=lambda one: math.hypot(one.x - x, one.y - y))
-            near = math.hypot(same.x - x, same.y - y) <= SAME_FRONTIER_M
-            if near and same.score < best.score + FRONTIER_HYSTERESIS_M:
-                best = same
+            current = min(found, key=lambda frontier: math.hypot(frontier.x - x, frontier.y - y))
+            same = math.hypot(current.x - x, current.y - y) <= SAME_FRONTIER_M
+            if same and current.score < best.score + FRONTIER_HYSTERESIS_M:
+                best = current
         return Goal(x=best.x, y=best.y)
 
     def _find(self, goal: Goal, request: RouteRequest, costs: Costmap) -> Path | Unreachable:
@@ -444,7 +444,7 @@ class RoutePlanner:
 def explained(
     found: Unreachable, zones: ZoneMap, bare: Costmap, body: BodyDescription, here: Pose, goal: Goal
 ) -> Unreachable:
-    """Return `found` with the zone that closes the way, if it is one; `bare` is without zones."""
+    """Return `found`, with the zone that closes the way if one does; `bare` is without zones."""
     if problem := zones.problem(goal.x, goal.y, bare.inflation.fits):
         return replace(found, fault=f"the goal {problem}")
     if found.fault != NO_WAY or zones.empty:
@@ -456,5 +456,5 @@ def explained(
 
 
 def _offset(found: Unreachable) -> str:
-    """Return how far from its goal the robot goes instead, and why, for people."""
+    """Return, for users, how far from its goal the robot goes instead, and why."""
     return f"{found.distance:.2f} m from the requested goal: {found.fault}"

@@ -1,4 +1,4 @@
-"""Keeps the route of the present command up to date, in a worker thread for large maps."""
+"""Keeps the route of the current command up to date, in a worker thread for large maps."""
 
 import numpy as np
 
@@ -14,52 +14,51 @@ from gigabrain_zenoh.host.threads import ScheduledWorker, Take
 from gigabrain_zenoh.navigation.contours import placed
 from gigabrain_zenoh.navigation.zones import ZoneMap
 
-SMALL_MAP_CELLS = 60_000  # routes in larger maps are planned in a worker thread,
-CELLS_PER_SCAN = 250_000  # every this many cells add one scan until a plan is due
-MIN_DUE_SCANS = 2
-HUNG_SCANS = 200  # a plan that is overdue for this many scans will never finish
-PATIENCE_S = 0.05  # how long a scan waits for a due plan; control waits no longer
+SMALL_MAP_CELLS = 60_000  # routes in larger maps are planned in a worker thread
+MIN_DUE_SCANS = 2  # a plan is due after so many scans,
+CELLS_PER_SCAN = 250_000  # and one more per so many cells
+HUNG_SCANS = 200  # a plan that is overdue for so many scans will never finish
+PATIENCE_S = 0.05  # a scan waits so long for a due plan; control does not wait longer
 REPLAN_TICKS = 25  # a route is checked at least twice a second,
-LOOK_TICKS = 10  # and more often where what cameras see decides
+LOOK_TICKS = 10  # and more often while searching, as it depends on what cameras see
 
 
 class RouteSchedule:
-    """Keeps the present route up to date."""
+    """Plans and replans the current route."""
 
     def __init__(self, config: NavigationConfig, bus: Bus) -> None:
         self.inflation = config.inflation  # [m], of the next plan
         self._planner = RoutePlanner(config.unknown_space)
         self._worker = ScheduledWorker(PATIENCE_S, bus.input_log.in_time)
         self.route: Route | None = None
-        self._planned: tuple[int, OccupancyGrid, ZoneMap] | None = None  # tick, map and zones of
-        # the last plan
+        self._planned: tuple[int, OccupancyGrid, ZoneMap] | None = None  # inputs of the last plan
         self._feedback: RouteFeedback | None = None
         self._walkers = Walkers()
-        self._stands = False  # the route was not followed in the last step
-        self._counted = (0, 0)  # boot and tick until which `_held_ticks` has counted
+        self._not_followed = False  # there was a route in the last step, but it was not followed
+        self._counted = (0, 0)  # boot and tick up to which `_held_ticks` is counted
         self._held_ticks = 0  # since the last request
 
     def at_scan(self) -> None:
-        """Take the route from the worker thread, if it is due at this scan."""
+        """Take the route from the worker thread if it is due at this scan."""
         self._worker.at_scan()
 
     def count_held(self, boot: int, tick: int, held: str) -> None:
-        """Add the ticks since the last call if the body did not follow its route in them."""
+        """Count the ticks since the last call in which the body did not follow its route."""
         counted_boot, counted = self._counted
         if boot != counted_boot:
             counted, self._held_ticks = tick, 0
-        if held or self._stands:
+        if held or self._not_followed:
             self._held_ticks += max(0, tick - counted)
         self._counted = boot, max(tick, counted)
 
     def report(self, feedback: RouteFeedback | None) -> None:
-        """Record how the present route was driven in this step; None if it was not."""
+        """Record how the current route was followed in this step; None if it was not."""
         self._feedback = feedback or self._feedback
         route = self.route
-        self._stands = feedback is None and route is not None and route.points is not None
+        self._not_followed = feedback is None and route is not None and route.points is not None
 
     def watch(self, context: NavigationContext) -> None:
-        """Take in who walks, at each scan, whether the robot drives or not."""
+        """Track walking people; called at each scan, also while the robot stands."""
         if context.world and context.map_from_odom:
             self._walkers.update(context.tick, context.world.obstacles, context.map_from_odom)
 
@@ -71,12 +70,12 @@ class RouteSchedule:
         grid: OccupancyGrid,
         zones: ZoneMap,
     ) -> None:
-        """Plan a route if one is due; in a large map it becomes `route` at a later scan."""
+        """Plan a route if one is due; in a large map it replaces `route` at a later scan."""
         assert context.world
         assert context.body
         cells = grid.width * grid.height
         scans = MIN_DUE_SCANS + cells // CELLS_PER_SCAN
-        if not self._worker.idle:  # maybe with a larger map, which this one has replaced
+        if not self._worker.idle:  # maybe with an older, larger map
             self._worker.hasten(scans)
             return
         if not self._due(command, context.tick, grid, zones):
@@ -129,9 +128,9 @@ class RouteSchedule:
         route = self.route
         if route is None or self._planned is None or route.number != command.number:
             return True
-        before, known, rules = self._planned
+        planned_tick, planned_grid, planned_zones = self._planned
         if self._feedback and self._feedback.arrived and self._feedback.version == route.version:
             return True
-        changed = grid is not known or zones is not rules
+        changed = grid is not planned_grid or zones is not planned_zones
         limit = LOOK_TICKS if command.kind == "look" else REPLAN_TICKS
-        return changed or not 0 <= tick - before < limit
+        return changed or not 0 <= tick - planned_tick < limit
