@@ -40,7 +40,7 @@ def track_of(
 
 
 @lean_kernel
-def way_left(track: Floats, radius: float, x: float, y: float, yaw: float) -> float:
+def remaining_track(track: Floats, radius: float, x: float, y: float, yaw: float) -> float:
     """Return what is left [m] from a pose, by way of the best pose of the track."""
     least = math.inf
     for n in range(len(track)):

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from gigabrain_schemas.arrays import Floats
 from gigabrain_zenoh.kernels.jit import kernel
-from gigabrain_zenoh.navigation.footprint import DistanceGrid, between
+from gigabrain_zenoh.navigation.footprint import DistanceGrid, interpolate
 from gigabrain_zenoh.navigation.zones import fill
 
 COARSER = 2  # cells of the window per cell of the field, along each axis
@@ -172,7 +172,7 @@ def _scale_costs(halves: Units, cell: float, x: float, y: float, ways: Ways) -> 
     for i in range(halves.shape[1]):
         for j in range(halves.shape[1]):
             u, v = (x + (j + 0.5) * cell) * per_cell - 0.5, (y + (i + 0.5) * cell) * per_cell - 0.5
-            times = between(price, u, v)
+            times = interpolate(price, u, v)
             halves[0, i, j + 1] = np.int32(halves[0, i, j + 1] * times)
             halves[1, i, j + 1] = np.int32(halves[1, i, j + 1] * times)
 
@@ -185,7 +185,7 @@ def _seed_rim(known: Units, cell: float, x: float, y: float, ways: Ways) -> None
         step = 1 if i in (0, side - 1) else side - 1
         for j in range(0, side, step):
             u, v = (x + (j + 0.5) * cell) * per_cell - 0.5, (y + (i + 0.5) * cell) * per_cell - 0.5
-            known[i, j] = np.int32(between(field, u, v) / UNIT)
+            known[i, j] = np.int32(interpolate(field, u, v) / UNIT)
 
 
 @kernel

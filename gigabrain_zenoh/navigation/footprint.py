@@ -9,36 +9,36 @@ from numpy.typing import NDArray
 from gigabrain_zenoh.geometry.sweep import Corners, box
 from gigabrain_zenoh.kernels.jit import lean_kernel
 
-SPACING = 0.05  # [m], between points on the outline at most,
-MAX_POINTS = 500  # unless there were more than so many: those of a long outline are farther apart
-GROUP = 3  # neighbouring points that are left out together: two and one in the middle
-STRETCH = 1.02  # a distance in the grid differs by no more than so many times the way,
-UNSURE = 0.87  # and so many cells, between one that is looked up in the nearest cell and any other
-MAX_CLEARANCE_M = 0.4  # [m], more than that round the body makes no difference
-FAR = 3.0  # [m], what is farther away, or beyond the window, does not matter
+MAX_SPACING_M = 0.05  # between points of an outline that needs fewer than MAX_POINTS
+MAX_POINTS = 500
+GROUP_SIZE = 3  # neighbouring points that are skipped together: a middle one and its neighbours
+MAX_SLOPE = 1.02  # change of the distance in the grid per metre
+NEAREST_CELL_ERROR = 0.87  # [cells], of the distance of the nearest cell, besides MAX_SLOPE
+MAX_CLEARANCE_M = 0.4  # a larger clearance counts as this one
+MAX_DISTANCE_M = 3.0  # to obstacles; also outside the window
 
 
 Singles = NDArray[np.float32]
 
 
 class Outline(NamedTuple):
-    """A footprint as compiled functions take it, in the body's frame."""
+    """Footprint for kernels, in the body's frame."""
 
-    groups: Singles  # (n, 7) [m]: x and y of neighbours, and how far the outer two
-    # are from the middle one at most; once round, the last repeated to fill its group
-    center_x: float  # [m], of the box around it
+    groups: Singles  # (n, 7) [m]: x of three neighbours, their y, and the largest distance of the
+    # outer two to the middle one; the last point is repeated to fill its group
+    center_x: float  # [m], center of the bounding box
     center_y: float
-    inner: float  # [m], radius of the largest circle round the center that is inside the box
-    outer: float  # [m], how far it reaches from the center
-    front: float  # [m], the box
+    inner: float  # [m], radius of the largest circle round the center inside the outline
+    outer: float  # [m], largest distance of the outline to the center
+    front: float  # [m], edges of the bounding box
     rear: float
     left: float
     right: float
-    far: float  # [m], how far it reaches from the body's origin
+    far: float  # [m], largest distance of the outline to the body's origin
 
 
 class Placement(NamedTuple):
-    """Pose of a body, its heading as cosine and sine."""
+    """Pose of a body, with the cosine and sine of its heading."""
 
     x: float  # [m]
     y: float
@@ -47,19 +47,19 @@ class Placement(NamedTuple):
 
 
 class DistanceGrid(NamedTuple):
-    """Distances to the nearest obstacle, bilinear between the centers of cells."""
+    """Distances to the nearest obstacle at cell centers, interpolated bilinearly."""
 
     distance: Singles  # (rows, columns) [m]
-    cell: float  # [m]
+    cell: float  # [m], size of a cell
     x: float  # [m], of the corner of cell (0, 0)
     y: float
 
 
 def outline_of(footprint: Corners) -> Outline:
-    """Return the outline of any polygon."""
+    """Return the outline of a footprint, which may be any polygon."""
     corners = np.array(footprint, dtype=np.float64)
     sides = np.roll(corners, -1, axis=0) - corners
-    spacing = max(SPACING, float(np.hypot(*sides.T).sum()) / MAX_POINTS)
+    spacing = max(MAX_SPACING_M, float(np.hypot(*sides.T).sum()) / MAX_POINTS)
     pieces = []
     for start, side in zip(corners, sides, strict=True):
         count = max(1, math.ceil(float(np.hypot(*side)) / spacing))
@@ -68,11 +68,11 @@ def outline_of(footprint: Corners) -> Outline:
     x, y = (front + rear) / 2, (left + right) / 2
     points = np.concatenate(pieces)
     outer = float(np.hypot(corners[:, 0] - x, corners[:, 1] - y).max())
-    # a polygon's own inside, so that what has got under a thin or hollow one counts as well
+    # inside the polygon itself, so that obstacles under a thin or hollow body count as well
     inner = float(np.hypot(points[:, 0] - x, points[:, 1] - y).min())
     far = float(np.hypot(*corners.T).max())
-    points = np.pad(points, ((0, -len(points) % GROUP), (0, 0)), mode="edge")
-    threes = points.reshape(-1, GROUP, 2)
+    points = np.pad(points, ((0, -len(points) % GROUP_SIZE), (0, 0)), mode="edge")
+    threes = points.reshape(-1, GROUP_SIZE, 2)
     away = threes - threes[:, 1, None]
     reach = np.hypot(away[..., 0], away[..., 1]).max(axis=1)
     groups = np.column_stack([threes[..., 0], threes[..., 1], reach]).astype(np.float32)
@@ -83,15 +83,18 @@ def outline_of(footprint: Corners) -> Outline:
 def distance_at(grid: DistanceGrid, x: float, y: float) -> float:
     """Return the distance [m] from (x, y) to the nearest obstacle."""
     per_cell = 1.0 / grid.cell
-    return between(grid.distance, (x - grid.x) * per_cell - 0.5, (y - grid.y) * per_cell - 0.5)
+    return interpolate(grid.distance, (x - grid.x) * per_cell - 0.5, (y - grid.y) * per_cell - 0.5)
 
 
 @lean_kernel
-def between(distance: Singles, u: float, v: float) -> float:
-    """Interpolate `distance` (rows, columns) between cell centers, (0, 0) at the first."""
+def interpolate(distance: Singles, u: float, v: float) -> float:
+    """Interpolate `distance` (rows, columns) at column `u` and row `v`, in cells.
+
+    The center of the first cell is (0, 0). Outside the grid the result is MAX_DISTANCE_M.
+    """
     rows, columns = distance.shape
     if u < 0.0 or v < 0.0 or u >= columns - 1 or v >= rows - 1:
-        return FAR
+        return MAX_DISTANCE_M
     i, j, one = np.uint32(v), np.uint32(u), np.uint32(1)
     a, b = v - i, u - j
     low = distance[i, j] + b * (distance[i, j + one] - distance[i, j])
@@ -104,18 +107,18 @@ def between(distance: Singles, u: float, v: float) -> float:
 def clearance_of(
     grid: DistanceGrid, outline: Outline, at: Placement, middle: float, first: int
 ) -> tuple[float, int]:
-    """Return the clearance [m], and the group of points that has it.
+    """Return the clearance [m], and the index of the group of points nearest to an obstacle.
 
-    The clearance is the distance of the outline to the nearest obstacle, below 0 with one inside,
-    and MAX_CLEARANCE_M at most. Groups are compared from `first` on, so that a good guess spares
-    others. `middle` is the result of `middle_of`.
+    The clearance is the distance of the outline to the nearest obstacle. It is negative with an
+    obstacle inside, and MAX_CLEARANCE_M at most. Group `first` is examined first: if it is the
+    nearest, most others are skipped. `middle` is the result of `middle_of`.
     """
     if middle >= outline.outer + MAX_CLEARANCE_M:
         return MAX_CLEARANCE_M, first
     nearest = MAX_CLEARANCE_M
     if middle < outline.inner:
         nearest = min(nearest, middle - outline.inner)
-    found, group = _nearest(grid, outline, at, np.float32(nearest), first)
+    found, group = _nearest_group(grid, outline, at, np.float32(nearest), first)
     return min(nearest, found), group
 
 
@@ -132,44 +135,44 @@ CellPlacement = tuple[np.float32, np.float32, np.float32, np.float32]  # column,
 
 
 @lean_kernel
-def _nearest(
+def _nearest_group(
     grid: DistanceGrid, outline: Outline, at: Placement, nearest: np.float32, first: int
 ) -> tuple[float, int]:
-    """Return the least distance [m] of all points, if below `nearest`, and its group.
+    """Return the least of `nearest` and the distances of all points [m], and its group.
 
-    A group is left out when the distance of its middle leaves no room for anything nearer.
+    A group is skipped when the distance of its middle shows that none of its points is nearer.
     """
     x, y, cosine, sine = at
     groups, cells, per_cell = outline.groups, grid.distance, 1.0 / grid.cell
     u, v = np.float32((x - grid.x) * per_cell - 0.5), np.float32((y - grid.y) * per_cell - 0.5)
     placed = (u, v, np.float32(cosine * per_cell), np.float32(sine * per_cell))
-    half, unsure = np.float32(0.5), np.float32(UNSURE * grid.cell)
+    half, cell_error = np.float32(0.5), np.float32(NEAREST_CELL_ERROR * grid.cell)
     best = first
-    nearest = _least_of_group(cells, groups[first], placed, nearest)
+    nearest = _group_distance(cells, groups[first], placed, nearest)
     for n in range(len(groups)):
         if n == first:
             continue
         group = groups[n]
-        column, row = _inside(cells, group[1], group[4], placed)
-        there = cells[np.uint32(row + half), np.uint32(column + half)]
-        if there - np.float32(STRETCH) * group[6] - unsure < nearest:
-            found = _least_of_group(cells, group, placed, nearest)
+        column, row = _cell_inside(cells, group[1], group[4], placed)
+        middle_distance = cells[np.uint32(row + half), np.uint32(column + half)]
+        if middle_distance - np.float32(MAX_SLOPE) * group[6] - cell_error < nearest:
+            found = _group_distance(cells, group, placed, nearest)
             best = n if found < nearest else best
             nearest = found
     return float(nearest), best
 
 
 @lean_kernel
-def _least_of_group(
+def _group_distance(
     cells: Singles, group: Singles, placed: CellPlacement, nearest: np.float32
 ) -> np.float32:
-    """Return the least of `nearest` and the distances [m] of the points of a group.
+    """Return the least of `nearest` and the distances of a group's points [m].
 
-    A point beyond the window counts as if it were on its rim.
+    A point outside the window counts as if it were on the rim.
     """
-    one = np.uint32(1)  # unsigned: numba need not look for indices from the end
-    for n in range(GROUP):
-        column, row = _inside(cells, group[n], group[n + GROUP], placed)
+    one = np.uint32(1)  # unsigned, so that numba does not check for negative indices
+    for n in range(GROUP_SIZE):
+        column, row = _cell_inside(cells, group[n], group[n + GROUP_SIZE], placed)
         i, j = np.uint32(row), np.uint32(column)
         a, b = row - np.float32(i), column - np.float32(j)
         low = cells[i, j] + b * (cells[i, j + one] - cells[i, j])
@@ -180,10 +183,10 @@ def _least_of_group(
 
 
 @lean_kernel
-def _inside(
+def _cell_inside(
     cells: Singles, x: np.float32, y: np.float32, placed: CellPlacement
 ) -> tuple[np.float32, np.float32]:
-    """Return column and row of the point (x, y) of a body; on the rim for one beyond it."""
+    """Return column and row of point (x, y) of a body, limited to the grid."""
     (u, v, c, s), zero = placed, np.float32(0)
     last_u, last_v = np.float32(cells.shape[1] - 2), np.float32(cells.shape[0] - 2)
     return min(max(u + c * x - s * y, zero), last_u), min(max(v + s * x + c * y, zero), last_v)
@@ -194,52 +197,52 @@ def free_ahead(
     grid: DistanceGrid, outline: Outline, at: Placement, sign: float, side_margin: float,
     reach: float,
 ) -> float:  # fmt: skip
-    """Return the free way straight on, or back for a `sign` of -1, within `reach` [m].
+    """Return the free distance ahead, or behind for a `sign` of -1; `reach` [m] at most.
 
-    The strip is as wide as the body and `side_margin` [m], and is covered by discs from the front
-    edge on. The search ends at the rim of the grid, however far `reach` is.
+    The strip is as wide as the body with `side_margin` [m] on both sides. It is covered by discs,
+    from the edge of the body on. The search ends at the rim of the grid.
     """
     x, y, cosine, sine = at
     half = (outline.left - outline.right) / 2
     edge = outline.front if sign > 0 else -outline.rear
     begin = edge - half
-    gone, rows, columns = 0.0, grid.distance.shape[0], grid.distance.shape[1]
+    covered, rows, columns = 0.0, grid.distance.shape[0], grid.distance.shape[1]
     end = min(reach, (rows + columns) * grid.cell + 2.0 * outline.far)
-    while gone < end:
-        along = sign * (begin + gone)
+    while covered < end:
+        along = sign * (begin + covered)
         px = x + cosine * along - sine * outline.center_y
         py = y + sine * along + cosine * outline.center_y
         room = distance_at(grid, px, py) - half - side_margin
         if room <= 0.0:
-            return gone
-        gone += max(room, 0.05)
+            return covered
+        covered += max(room, 0.05)
     return reach
 
 
 @lean_kernel
 def free_along(
-    grid: DistanceGrid, outline: Outline, at: Placement, way: tuple[float, float],
+    grid: DistanceGrid, outline: Outline, at: Placement, direction: tuple[float, float],
     side_margin: float, reach: float,
 ) -> float:  # fmt: skip
-    """Return the free way in any direction of the body's frame, as `free_ahead` does ahead.
+    """Return the free distance in any direction, like `free_ahead`.
 
-    `way` is that direction, of length 1.
+    `direction` is a unit vector in the body's frame.
     """
     x, y, cosine, sine = at
     long, wide = (outline.front - outline.rear) / 2, (outline.left - outline.right) / 2
-    half = abs(way[0]) * wide + abs(way[1]) * long
-    edge = min(long / max(abs(way[0]), 1e-6), wide / max(abs(way[1]), 1e-6))
-    along_x = cosine * way[0] - sine * way[1]
-    along_y = sine * way[0] + cosine * way[1]
+    half = abs(direction[0]) * wide + abs(direction[1]) * long
+    edge = min(long / max(abs(direction[0]), 1e-6), wide / max(abs(direction[1]), 1e-6))
+    along_x = cosine * direction[0] - sine * direction[1]
+    along_y = sine * direction[0] + cosine * direction[1]
     x += cosine * outline.center_x - sine * outline.center_y
     y += sine * outline.center_x + cosine * outline.center_y
     begin = edge - half
-    gone, rows, columns = 0.0, grid.distance.shape[0], grid.distance.shape[1]
+    covered, rows, columns = 0.0, grid.distance.shape[0], grid.distance.shape[1]
     end = min(reach, (rows + columns) * grid.cell + 2.0 * outline.far)
-    while gone < end:
-        px, py = x + along_x * (begin + gone), y + along_y * (begin + gone)
+    while covered < end:
+        px, py = x + along_x * (begin + covered), y + along_y * (begin + covered)
         room = distance_at(grid, px, py) - half - side_margin
         if room <= 0.0:
-            return gone
-        gone += max(room, 0.05)
+            return covered
+        covered += max(room, 0.05)
     return reach

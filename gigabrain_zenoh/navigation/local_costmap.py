@@ -18,7 +18,7 @@ from gigabrain_schemas.base import TICK_NS
 from gigabrain_zenoh.kernels.images import connected_parts
 from gigabrain_zenoh.kernels.jit import kernel, lean_kernel
 from gigabrain_zenoh.navigation.contours import covered
-from gigabrain_zenoh.navigation.footprint import FAR, DistanceGrid
+from gigabrain_zenoh.navigation.footprint import MAX_DISTANCE_M, DistanceGrid
 from gigabrain_zenoh.navigation.zones import fill
 
 RIM_CELLS = 2  # cells round the window, from which nothing is near
@@ -285,7 +285,7 @@ class LocalCostmap:
 
     def __init__(self, size: float, memory_s: float) -> None:
         self.cells = 2 * round(size / CELL_M / 2)
-        self._chamfer = Chamfer(self.cells, CELL_M, FAR)
+        self._chamfer = Chamfer(self.cells, CELL_M, MAX_DISTANCE_M)
         self._memory = round(memory_s * 1e9 / TICK_NS)
         self._held, self._spare = _nothing(self.cells), _nothing(self.cells)
         self._row = self._column = 0  # of cell (0, 0), counted from the frame's origin

@@ -16,7 +16,7 @@ from gigabrain_zenoh.geometry.limits import SentCommand
 from gigabrain_zenoh.geometry.se2 import from_pose, transform
 from gigabrain_zenoh.navigation import dynamic_obstacles
 from gigabrain_zenoh.navigation.car_track import no_track, track_of
-from gigabrain_zenoh.navigation.cost import SECOND
+from gigabrain_zenoh.navigation.cost import COST_PER_S
 from gigabrain_zenoh.navigation.cost_to_go import CostToGo
 from gigabrain_zenoh.navigation.footprint import outline_of
 from gigabrain_zenoh.navigation.local_costmap import LocalCostmap, Pose2D
@@ -202,7 +202,9 @@ class LocalPlanner:
         if lookout:
             request = replace(request, goal=lookout, path=None, headings=None)
         if self._model.strafes and request.goal.yaw is not None:
-            weights = weights._replace(turning=TURN_COST_SHARE * SECOND / self._model.turning**2)
+            weights = weights._replace(
+                turning=TURN_COST_SHARE * COST_PER_S / self._model.turning**2
+            )
         scene = self._scene(request, discs)
         model = delayed_model(model, request.delayed)
         planned = self._sampler.plan(

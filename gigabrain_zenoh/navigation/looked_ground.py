@@ -20,7 +20,7 @@ from gigabrain_schemas.body import BodyDescription, Camera
 from gigabrain_zenoh.geometry.polygon import points_on_edges
 from gigabrain_zenoh.geometry.stopping import brakes
 from gigabrain_zenoh.geometry.sweep import radius
-from gigabrain_zenoh.navigation.footprint import FAR, DistanceGrid
+from gigabrain_zenoh.navigation.footprint import MAX_DISTANCE_M, DistanceGrid
 from gigabrain_zenoh.navigation.local_costmap import (
     CELL_M,
     Chamfer,
@@ -56,7 +56,7 @@ class LookedGround:
         self._margin = along.reach if aside else MARGIN_M
         self._looked = np.zeros((side, side), np.uint8)
         self._row = self._column = 0  # of cell (0, 0)
-        self._chamfer = Chamfer(side, CELL_M, FAR)
+        self._chamfer = Chamfer(side, CELL_M, MAX_DISTANCE_M)
         self._began = False
 
     def limited(

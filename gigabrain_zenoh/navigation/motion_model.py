@@ -1,6 +1,6 @@
-"""Motion model of a body, and where plans of commands lead, LANES at a time.
+"""Motion model of a body, and simulation of plans, LANES at a time.
 
-The body answers a command after its delay, then as a first-order lag.
+The body reacts to a command after a delay, with a first-order lag.
 """
 
 import math
@@ -11,39 +11,42 @@ from gigabrain_schemas.body import BodyDescription
 from gigabrain_zenoh.geometry.limits import limits_of
 from gigabrain_zenoh.kernels.jit import lean_kernel
 
-ACCELERATION_RESERVE = 0.9  # of the body's accelerations: plans must work on a bad floor too
-GENTLEST_SHARE = 0.4  # of that reserve, at an aggressiveness of 0
-MIN_SPEED = 0.01  # [m/s]; a body that may drive at all may drive so fast
-MAX_REVERSE_SPEED = 0.4  # [m/s], no faster backwards: the lidar may not see there
-SLOWEST = 0.001  # [m/s], where it must not reverse
+ACCELERATION_SHARE = 0.9  # of the body's accelerations, as plans must work on slippery floors too
+MIN_ACCELERATION_SHARE = 0.4  # of those again, at an aggressiveness of 0
+MIN_SPEED = 0.01  # [m/s], lowest speed limit
+MAX_REVERSE_SPEED = 0.4  # [m/s], as the lidar may not see behind the body
+MIN_DIVISOR = 0.001  # [m/s], in place of a reverse speed of 0
 STRAFING = ("mecanum", "omni")  # drive types
 
 LANES = 8  # plans at a time
-X, Y, YAW, VX, VY, W = range(0, 6 * LANES, LANES)  # where the lanes of each begin in a state:
-COSINE, SINE, MOVED = range(6 * LANES, 9 * LANES, LANES)  # its pose, velocity, and the way [m] that
-MIDDLE, SURE, AWAY, CLOSE = range(9 * LANES, 13 * LANES, LANES)  # no point exceeds; see price.py
+# Offsets of the lanes of each quantity in a state. MOVED [m] is an upper bound of the distance
+# that any point of the body moves in the step. `cost.evaluate_surroundings` fills the last four.
+X, Y, YAW, VX, VY, W = range(0, 6 * LANES, LANES)
+COSINE, SINE, MOVED = range(6 * LANES, 9 * LANES, LANES)
+MIDDLE_DISTANCE, MIN_COST, DISC_DISTANCE, DISC_COST = range(9 * LANES, 13 * LANES, LANES)
 STATE = 13 * LANES
-SECOND_X, SECOND_Y, SECOND_TURN = range(3 * LANES, 6 * LANES, LANES)  # of two commands in a row
+# Offsets of the second of two successive commands.
+SECOND_X, SECOND_Y, SECOND_TURN = range(3 * LANES, 6 * LANES, LANES)
 COMMAND = 3 * LANES
 
 
 class MotionModel(NamedTuple):
     """Limits of a body's motion."""
 
-    forward: float  # [m/s], fastest
-    backward: float  # [m/s], fastest, as a positive number
-    lateral: float  # [m/s]; 0 for bodies that cannot go sideways
-    turning: float  # [rad/s]
+    forward: float  # [m/s], maximum
+    backward: float  # [m/s], maximum, positive
+    lateral: float  # [m/s], maximum; 0 for bodies that cannot move sideways
+    turning: float  # [rad/s], maximum
     acceleration: float  # [m/s2]
     deceleration: float  # [m/s2]
     angular_acceleration: float  # [rad/s2]
-    radius: float  # [m], of the tightest turn of a car; 0 for bodies that turn on the spot
-    reaction_time: float  # [s] from a scan to the brake
+    radius: float  # [m], turning radius of a car; 0 for bodies that turn on the spot
+    reaction_time: float  # [s], from a scan to braking
     margin: float  # [m], kept free in front of the body at rest
     side_margin: float  # [m], kept free beside it
-    rim: float  # [m/s], fastest of each wheel of a differential base; inf for others
-    half_track: float  # [m], from its middle to a wheel
-    strafes: bool  # it is made to go sideways, and need not face its way
+    rim: float  # [m/s], maximum of each wheel of a differential base; inf for others
+    half_track: float  # [m], from the middle of the base to a wheel
+    strafes: bool  # it may drive sideways instead of turning first
 
 
 def model_of(
@@ -51,20 +54,22 @@ def model_of(
 ) -> MotionModel:
     """Return the model of `body`, driven no faster than `speed` [m/s].
 
-    Below an `aggressiveness` of 0.5, to 0, it gains speed ever more gently.
+    An `aggressiveness` below 0.5 reduces the acceleration.
     """
     fastest = body.max_linear_speed if speed is None else min(speed, body.max_linear_speed)
-    eager = min(1.0, 2.0 * aggressiveness)
-    gain = ACCELERATION_RESERVE * (GENTLEST_SHARE + (1.0 - GENTLEST_SHARE) * eager)
+    eagerness = min(1.0, 2.0 * aggressiveness)
+    gain = ACCELERATION_SHARE * (
+        MIN_ACCELERATION_SHARE + (1.0 - MIN_ACCELERATION_SHARE) * eagerness
+    )
     car, limits = body.drive_type == "ackermann", limits_of(body)
-    sees_ahead = any(camera.depth for camera in body.cameras)  # so it had better face its way
+    sees_ahead = any(camera.depth for camera in body.cameras)  # then it should face its path
     return MotionModel(
         forward=fastest,
         backward=min(MAX_REVERSE_SPEED, 0.5 * fastest),
         lateral=0.0 if car else min(body.max_lateral_speed, fastest),
         turning=body.max_angular_speed,
         acceleration=gain * body.max_linear_acceleration,
-        deceleration=ACCELERATION_RESERVE * body.max_linear_deceleration,
+        deceleration=ACCELERATION_SHARE * body.max_linear_deceleration,
         angular_acceleration=gain * body.max_angular_acceleration,
         radius=body.turning_radius,
         reaction_time=body.thresholds.reaction_time,
@@ -77,7 +82,7 @@ def model_of(
 
 
 def slowed_model(model: MotionModel, speed: float | None) -> MotionModel:
-    """Return the model of a body that must not drive faster than `speed` [m/s]."""
+    """Return `model` with speeds up to `speed` [m/s]."""
     if speed is None or speed >= model.forward:
         return model
     slow = max(speed, MIN_SPEED)
@@ -87,7 +92,7 @@ def slowed_model(model: MotionModel, speed: float | None) -> MotionModel:
 
 
 def delayed_model(model: MotionModel, seconds: float) -> MotionModel:
-    """Return the model of a body that reacts later, with speeds that keep the stopping distance."""
+    """Return a model that reacts `seconds` later, with the same stopping distance."""
     if seconds <= 0.0:
         return model
     reaction, brake = model.reaction_time + seconds, model.deceleration
@@ -105,9 +110,9 @@ def delayed_model(model: MotionModel, seconds: float) -> MotionModel:
 
 @lean_kernel
 def step_toward(before: float, target: float, up: float, down: float) -> float:
-    """Return `target`, or the nearest value that one step from `before` reaches.
+    """Return the value nearest to `target` that one step from `before` can reach.
 
-    A step lasts several ticks, so it may pass 0, where a ramp rests for a tick.
+    A step may pass 0: it lasts several ticks, and a ramp stays at 0 for one of them only.
     """
     highest = before + (up if before >= 0.0 else down)
     lowest = before - (up if before <= 0.0 else down)
@@ -115,11 +120,11 @@ def step_toward(before: float, target: float, up: float, down: float) -> float:
 
 
 @lean_kernel
-def no_faster_aslant(model: MotionModel, vx: float, vy: float) -> tuple[float, float]:
-    """Return a velocity of a body that strafes, no faster aslant than straight on."""
+def limit_slanted(model: MotionModel, vx: float, vy: float) -> tuple[float, float]:
+    """Limit a strafing body's velocity to the ellipse through its limits ahead and sideways."""
     vx = max(-model.backward, min(model.forward, vx))
     vy = max(-model.lateral, min(model.lateral, vy))
-    along = vx / (model.forward if vx > 0.0 else max(model.backward, SLOWEST))
+    along = vx / (model.forward if vx > 0.0 else max(model.backward, MIN_DIVISOR))
     slant = math.sqrt(along * along + (vy / model.lateral) ** 2)
     return (vx / slant, vy / slant) if slant > 1.0 else (vx, vy)
 
@@ -133,7 +138,7 @@ def feasible(
 ) -> tuple[float, float, float]:
     """Return the command nearest to `target` that the body can obey `dt` [s] after `before`.
 
-    See `no_faster_aslant` for a body that strafes.
+    Targets of strafing bodies need `limit_slanted` first.
     """
     up, down = model.acceleration * dt, model.deceleration * dt
     turn = model.angular_acceleration * dt
@@ -155,8 +160,8 @@ def feasible(
 class FirstOrderLag(NamedTuple):
     """A first-order lag over one step."""
 
-    decay: float  # what is left of a difference after it
-    glide: float  # [s], what a difference of 1 m/s adds to the way [m]
+    decay: float  # remaining share of a velocity error after the step
+    glide: float  # [s], distance that the error adds, per unit of it
 
 
 def first_order_lag(seconds: float, dt: float) -> FirstOrderLag:
@@ -179,31 +184,31 @@ def lagged_step(
 class InitialState(NamedTuple):
     """Pose and velocity of the body, and the commands on their way to it."""
 
-    x: float  # [m], in the frame that is planned in
+    x: float  # [m], in the planning frame
     y: float
     yaw: float  # [rad]
     vx: float  # [m/s], as measured
     vy: float
     w: float  # [rad/s]
     before: tuple[float, float, float]  # the last command
-    past: Floats  # (n + 1, 3), mean of what was sent in each of the last steps, oldest first
-    share: float  # of the first step that the oldest of them still rules, 0 to 1
+    past: Floats  # (n + 1, 3), mean commands of the last steps, oldest first
+    share: float  # of each step in which the older command is still in force, 0 to 1
     lag: FirstOrderLag
-    gain: float  # of the yaw rate: no more than so much of its largest can be had
+    gain: float  # of the yaw rate; one below 1 limits the yaw rate to this share of its maximum
 
 
 @lean_kernel
 def make_feasible(model: MotionModel, start: InitialState, dt: float, plans: Floats) -> None:
     """Make `plans` (T, 3, LANES) feasible in place.
 
-    In one array, and slices of it, all offsets are known: it is vectorised. So below.
+    Slices of one array have constant offsets, so that loops are vectorised; also below.
     """
     turning = model.turning * min(1.0, start.gain)
     flat = plans.reshape(-1)
-    for t in range(plans.shape[0] if model.strafes else 0):  # apart: it takes as long as the rest
+    for t in range(plans.shape[0] if model.strafes else 0):  # in its own loop: it is slow
         one = flat[t * COMMAND : (t + 1) * COMMAND]
         for lane in range(LANES):
-            slower = no_faster_aslant(model, one[lane], one[LANES + lane])
+            slower = limit_slanted(model, one[lane], one[LANES + lane])
             one[lane], one[LANES + lane] = slower
     for lane in range(LANES):
         wanted = max(-turning, min(turning, flat[2 * LANES + lane]))
@@ -222,26 +227,26 @@ def make_feasible(model: MotionModel, start: InitialState, dt: float, plans: Flo
 def simulate(
     model: MotionModel, far: float, start: InitialState, dt: float, plans: Floats, states: Floats
 ) -> None:
-    """Fill `states` (T + 1, STATE) with where feasible `plans` (T, 3, LANES) take the body.
+    """Fill `states` (T + 1, STATE) with the motion by feasible `plans` (T, 3, LANES).
 
-    It reaches so `far` [m] from its origin.
+    `far` [m] is the largest distance of the body's outline to its origin.
     """
     _fill_first(start, states[0])
     flat = states.reshape(-1)
     for t in range(plans.shape[0]):
-        _ruling_commands(start, plans, t, states[t + 1])
+        _fill_active_commands(start, plans, t, states[t + 1])
         s = flat[t * STATE : (t + 2) * STATE]
         for lane in range(LANES):
             n = STATE + lane
             vx, ahead = lagged_step(s[VX + lane], s[VX + n], start.lag, dt)
             vy, aside = lagged_step(s[VY + lane], s[VY + n], start.lag, dt)
             w, turned = lagged_step(s[W + lane], s[W + n], start.lag, dt)
-            cosine, sine = _turn(s[COSINE + lane], s[SINE + lane], 0.5 * turned)
+            cosine, sine = _rotate(s[COSINE + lane], s[SINE + lane], 0.5 * turned)
             s[X + n] = s[X + lane] + (cosine * ahead - sine * aside)
             s[Y + n] = s[Y + lane] + (sine * ahead + cosine * aside)
             s[YAW + n] = s[YAW + lane] + turned
             s[VX + n], s[VY + n], s[W + n] = vx, vy, w
-            s[COSINE + n], s[SINE + n] = _turn(cosine, sine, 0.5 * turned)
+            s[COSINE + n], s[SINE + n] = _rotate(cosine, sine, 0.5 * turned)
             s[MOVED + n] = abs(ahead) + abs(aside) + far * abs(turned)
 
 
@@ -255,29 +260,29 @@ def _fill_first(start: InitialState, state: Floats) -> None:
 
 
 @lean_kernel
-def _ruling_commands(start: InitialState, plans: Floats, t: int, state: Floats) -> None:
-    """Put the mean commands [m/s and rad/s] that rule the body in step `t` in their places."""
+def _fill_active_commands(start: InitialState, plans: Floats, t: int, state: Floats) -> None:
+    """Fill the velocities of `state` with the mean commands [m/s, rad/s] in force in step `t`."""
     older, newer = t - start.past.shape[0], t - start.past.shape[0] + 1
     share, rest = start.share, 1.0 - start.share
     for axis in range(3):
-        ruled = state[VX + axis * LANES : VX + (axis + 1) * LANES]
+        active = state[VX + axis * LANES : VX + (axis + 1) * LANES]
         if newer < 0:
             mean = share * start.past[t, axis] + rest * start.past[t + 1, axis]
             for lane in range(LANES):
-                ruled[lane] = mean
+                active[lane] = mean
         elif older < 0:
             old, new = share * start.past[t, axis], plans[newer, axis]
             for lane in range(LANES):
-                ruled[lane] = old + rest * new[lane]
+                active[lane] = old + rest * new[lane]
         else:
             before, new = plans[older, axis], plans[newer, axis]
             for lane in range(LANES):
-                ruled[lane] = share * before[lane] + rest * new[lane]
+                active[lane] = share * before[lane] + rest * new[lane]
 
 
 @lean_kernel
-def _turn(cosine: float, sine: float, angle: float) -> tuple[float, float]:
-    """Turn a direction by less than half a radian; Taylor's series is faster than sin and cos."""
+def _rotate(cosine: float, sine: float, angle: float) -> tuple[float, float]:
+    """Turn a direction by less than 0.5 rad, by a Taylor series: faster than sin and cos."""
     square = angle * angle
     c = 1.0 - square * (0.5 - square * (1.0 / 24.0 - square * (1.0 / 720.0)))
     s = angle * (1.0 - square * (1.0 / 6.0 - square * (1.0 / 120.0 - square * (1.0 / 5040.0))))

@@ -1,4 +1,4 @@
-"""Model predictive path integral control: samples plans, and averages the good ones by their cost.
+"""Model predictive path integral control: samples plans, and averages them by their cost.
 
 Williams et al., Information theoretic MPC for model-based reinforcement learning, ICRA 2017.
 """
@@ -15,7 +15,7 @@ from gigabrain_zenoh.navigation.cost import (
     cost_to_go_at,
     evaluate_surroundings,
     fill_clearances,
-    price,
+    plan_cost,
 )
 from gigabrain_zenoh.navigation.footprint import Outline
 from gigabrain_zenoh.navigation.motion_model import (
@@ -29,23 +29,23 @@ from gigabrain_zenoh.navigation.motion_model import (
 from gigabrain_zenoh.navigation.plan_bounds import bounds_of, may_cost_less
 from gigabrain_zenoh.navigation.planning_problem import Problem, Scene, Weights, motion_of
 
-NOISE_KEPT, NOISE_FRESH = 0.85, 0.53  # of the noise from step to step
-NOISE_SHARE, TURN_NOISE_SHARE = 0.175, 0.3  # of the noise, as a share of the largest speeds
+NOISE_KEPT, NOISE_FRESH = 0.85, 0.53  # autoregression of the noise from step to step
+NOISE_SHARE, TURN_NOISE_SHARE = 0.175, 0.3  # of the maximum speeds, standard deviation of noise
 SIMPLE_EVERY = 4  # every 4th plan is two constant twists without noise
-BRAKING_LANE = 2  # the plan that brakes
-SHARP_TURN_SHARE = 0.3  # how much of the yaw rate simple plans take at high speed
+BRAKING_LANE = 2  # of the first block: a plan that brakes
+SHARP_TURN_SHARE = 0.3  # of the maximum yaw rate, in simple plans at high speed
 
-TEMPERATURE = 0.6  # how much worse than the best still counts
-MIN_SHARE = 1e-3  # in units of the best one's; what would have less has none: under 1 % of all
-WORTHLESS_MARGIN = -TEMPERATURE * math.log(MIN_SHARE)  # so much worse than the best has less
-MEAN_MARGIN = 0.3  # a mean this much worse than the best has run into what its parts went round
-NOISE_SETS = 8  # of noise, drawn once and taken in turn
+TEMPERATURE = 0.6  # cost difference at which a plan's weight falls to 1/e
+MIN_WEIGHT = 1e-3  # the best plan's is 1; smaller ones, below 1 % in total, are neglected
+WORTHLESS_MARGIN = -TEMPERATURE * math.log(MIN_WEIGHT)  # cost above the best for MIN_WEIGHT
+MEAN_MARGIN = 0.3  # a mean that costs this much more than the best plan is not used
+NOISE_SETS = 8  # drawn once and used in turn
 
 
 def correlated_noise(
     random: np.random.Generator, shape: tuple[int, ...], model: MotionModel
 ) -> NDArray[np.float32]:
-    """Return autoregressive noise, so that neighbouring commands are similar."""
+    """Return noise of `shape` (sets, samples, T, 3) that is correlated from step to step."""
     noise = random.standard_normal(shape, dtype=np.float32)
     for t in range(1, shape[2]):
         noise[:, :, t] = NOISE_KEPT * noise[:, :, t - 1] + NOISE_FRESH * noise[:, :, t]
@@ -61,8 +61,8 @@ def two_twist_plans(
 ) -> Floats:
     """Return plans (sets, samples, 7) of two twists and the step at which the second begins.
 
-    Of every three, one keeps its first twist, and one turns on the spot before it drives on. Of
-    bodies that strafe, the third does not turn.
+    One in three keeps its first twist, and one turns on the spot before it drives. For strafing
+    bodies, the third does not turn.
     """
     first, second = (_twists(random, (sets, samples, 3), model) for _ in range(2))
     turning = np.arange(samples) // SIMPLE_EVERY % 3
@@ -79,13 +79,13 @@ def two_twist_plans(
 
 
 def _twists(random: np.random.Generator, shape: tuple[int, ...], model: MotionModel) -> Floats:
-    """Return random twists that the body can have; the faster, the less they turn."""
+    """Return random twists within the body's limits; fast ones turn less."""
     share = random.random(shape)
     twists = np.empty(shape)
     twists[..., 0] = -model.backward + (model.forward + model.backward) * share[..., 0]
     twists[..., 1] = model.lateral * (2.0 * share[..., 1] - 1.0)
-    most = np.where(twists[..., 0] > 0.5 * model.forward, SHARP_TURN_SHARE, 0.9)
-    twists[..., 2] = model.turning * most * (2.0 * share[..., 2] - 1.0)
+    turn_share = np.where(twists[..., 0] > 0.5 * model.forward, SHARP_TURN_SHARE, 0.9)
+    twists[..., 2] = model.turning * turn_share * (2.0 * share[..., 2] - 1.0)
     return twists
 
 
@@ -93,7 +93,7 @@ def _twists(random: np.random.Generator, shape: tuple[int, ...], model: MotionMo
 def fill_plans(
     plans: Floats, last: Floats, noise: NDArray[np.float32], simple: Floats, first: bool
 ) -> None:
-    """Fill the `plans` (T, 3, LANES) of a block; the `first` holds the last plan, and braking."""
+    """Fill a block of `plans` (T, 3, LANES); the `first` holds the last plan and a braking one."""
     for t in range(plans.shape[0]):
         for axis in range(3):
             plan, disturbed = plans[t, axis], noise[t, axis]
@@ -107,46 +107,46 @@ def fill_plans(
 
 
 class SampledPlan(NamedTuple):
-    """The plan that was chosen, and what it leads to."""
+    """The chosen plan, and its result."""
 
     commands: Floats  # (T, 3)
     track: Floats  # (T + 1, 6): x, y, yaw, vx, vy, w at the end of each step
-    room: float  # [m], of the body where it is, see `clearance_of`
-    left: float  # [m of free way], cost to go from there
+    room: float  # [m], clearance at the start, see `clearance_of`
+    left: float  # [m of free way], cost to go from the start
 
 
 class Samples(NamedTuple):
     """Sources of the sampled plans."""
 
     last: Floats  # (T, 3), the last plan
-    noise: NDArray[np.float32]  # (blocks, T, 3, LANES), added to it
+    noise: NDArray[np.float32]  # (blocks, T, 3, LANES), added to the last plan
     simple: Floats  # (samples, 7), see `two_twist_plans`
 
 
 class SamplerBuffers(NamedTuple):
-    """Arrays that are used again, plans in lanes."""
+    """Reused arrays, with plans in lanes."""
 
-    plans: Floats  # (blocks + 1, T, 3, LANES): those kept, one after the other; the last is a draft
+    plans: Floats  # (blocks + 1, T, 3, LANES): kept plans; the last block is a draft
     states: Floats  # (T + 1, STATE), of one block
-    costs: Floats  # (blocks, LANES), of those kept
-    origins: NDArray[np.int64]  # (samples,), the lanes that they were drafted in
+    costs: Floats  # (blocks, LANES), of the kept plans
+    origins: NDArray[np.int64]  # (samples,), lanes of the draft that the kept plans come from
 
 
 class Sampler:
-    """Plans by sampling; the same seed and the same questions give the same plans.
+    """Plans by sampling; the same seed and the same requests give the same plans.
 
-    It takes as many `samples` as asked for or a few more, for all lanes to be full.
+    `samples` is rounded up to fill all lanes.
     """
 
     def __init__(self, model: MotionModel, samples: int, steps: int, dt: float, seed: int) -> None:
-        self.dt, self._turn = dt, 0
+        self.dt, self._noise_set = dt, 0
         random = np.random.default_rng(seed)
         blocks = math.ceil(samples / LANES)
         noise = correlated_noise(random, (NOISE_SETS, blocks * LANES, steps, 3), model)
         lanes = noise.reshape(NOISE_SETS, blocks, LANES, steps, 3).transpose(0, 1, 3, 4, 2)
         self._noise = np.ascontiguousarray(lanes)
         self._simple = two_twist_plans(random, NOISE_SETS, blocks * LANES, steps, model)
-        self._work = SamplerBuffers(
+        self._buffers = SamplerBuffers(
             np.zeros((blocks + 1, steps, 3, LANES)),
             np.empty((steps + 1, STATE)),
             np.empty((blocks, LANES)),
@@ -156,14 +156,14 @@ class Sampler:
 
     def forget(self) -> None:
         """Discard the last plan."""
-        self.last, self._turn = np.zeros_like(self.last), 0
+        self.last, self._noise_set = np.zeros_like(self.last), 0
 
     def shift(self, seconds: float) -> None:
-        """Let time pass: the last plan begins so much later."""
+        """Remove the first `seconds` of the last plan, which are over."""
         self.last = _resampled(self.last, seconds / self.dt, 1.0)
 
     def step_by(self, dt: float) -> None:
-        """Plan in as many steps of this length [s] from now on."""
+        """Change the duration of the steps to `dt` [s], but not their number."""
         if dt != self.dt:
             step = dt / self.dt
             self.last, self.dt = _resampled(self.last, 0.5 * step - 0.5, step), dt
@@ -177,18 +177,18 @@ class Sampler:
         start: InitialState,
     ) -> SampledPlan:
         """Return the best plan found for a body that moves like `model`."""
-        noise, simple = self._noise[self._turn], self._simple[self._turn]
-        self._turn = (self._turn + 1) % NOISE_SETS
+        noise, simple = self._noise[self._noise_set], self._simple[self._noise_set]
+        self._noise_set = (self._noise_set + 1) % NOISE_SETS
         problem = Problem(model, outline, weights, scene, self.dt)
         samples = Samples(self.last, noise, simple)
-        found = SampledPlan(*_search(problem, start, samples, self._work))
+        found = SampledPlan(*_search(problem, start, samples, self._buffers))
         self.last = found.commands
         return found
 
 
 @kernel
 def _resampled(plan: Floats, begin: float, step: float) -> Floats:
-    """Interpolate `plan` (T, 3) from `begin` on, by `step`; beyond its ends it is constant."""
+    """Interpolate `plan` (T, 3) from `begin` by `step`; it is constant beyond its ends."""
     found = np.empty_like(plan)
     for n in range(len(plan)):
         inside = min(max(begin + n * step, 0.0), len(plan) - 1.0)
@@ -201,18 +201,18 @@ def _resampled(plan: Floats, begin: float, step: float) -> Floats:
 
 @kernel
 def _search(
-    problem: Problem, start: InitialState, samples: Samples, work: SamplerBuffers
+    problem: Problem, start: InitialState, samples: Samples, buffers: SamplerBuffers
 ) -> tuple[Floats, Floats, float, float]:
     """Return the fields of a SampledPlan.
 
-    Plans whose last pose alone makes them worthless beside an earlier one are dropped. The others
-    are kept together, and priced when they fill a block. In the end the draft becomes the weighted
-    mean of all, and the best.
+    Plans whose last pose shows that they are worthless are dropped. The others are collected, and
+    their costs are computed when they fill a block. In the end, the draft holds the weighted mean
+    of all plans, and the best plan.
     """
-    (plans, states, costs, origins), (last, noise, simple) = work, samples
+    (plans, states, costs, origins), (last, noise, simple) = buffers, samples
     draft, blocks, mean, best = plans[-1], len(costs), 0, 1
     rooms, found = np.empty(min(len(states), len(start.past))), np.empty(LANES)
-    bounds, least, kept, priced = bounds_of(problem, start, len(last)), math.inf, 0, 0
+    bounds, least, kept, evaluated = bounds_of(problem, start, len(last)), math.inf, 0, 0
     for block in range(blocks):
         fill_plans(draft, last, noise[block], simple[block * LANES :], block == 0)
         make_feasible(problem.model, start, problem.dt, draft)
@@ -222,15 +222,15 @@ def _search(
             if may_cost_less(problem, bounds, motion_of(states[-1], lane), limit):
                 _copy_lane(draft, lane, plans[kept // LANES], kept % LANES)
                 origins[kept], kept = lane, kept + 1
-        while kept - priced >= (LANES if block < blocks - 1 else 1):
-            now = costs[priced // LANES, : kept - priced]
-            _evaluate(problem, start, plans[priced // LANES], limit, states, rooms, now)
-            least, priced = min(least, now.min()), priced + LANES
-    _gather(plans, costs, origins[:kept], mean, best)
+        while kept - evaluated >= (LANES if block < blocks - 1 else 1):
+            now = costs[evaluated // LANES, : kept - evaluated]
+            _evaluate(problem, start, plans[evaluated // LANES], limit, states, rooms, now)
+            least, evaluated = min(least, now.min()), evaluated + LANES
+    _combine(plans, costs, origins[:kept], mean, best)
     make_feasible(problem.model, start, problem.dt, draft)
     _evaluate(problem, start, draft, math.inf, states, rooms, found[:2])
-    taken = best if found[mean] > found[best] + MEAN_MARGIN else mean
-    commands, track = _lane_result(draft, states, taken)
+    chosen = best if found[mean] > found[best] + MEAN_MARGIN else mean
+    commands, track = _lane_result(draft, states, chosen)
     left = cost_to_go_at(problem.scene.field, start.x, start.y)
     return commands, track, rooms[0], left
 
@@ -242,15 +242,15 @@ def _evaluate(
 ) -> None:  # fmt: skip
     """Fill `states`, and `costs` (n,) of the first lanes of feasible `plans` (T, 3, LANES).
 
-    A cost is inf where it must reach `limit`, or is worthless beside one before. With a limit of
-    inf none is, and `rooms` are filled as well.
+    A cost is inf if it reaches `limit`, or is worthless compared with an earlier lane. With a
+    limit of inf, all costs are exact, and `rooms` are filled as well.
     """
     simulate(problem.model, problem.outline.far, start, problem.dt, plans, states)
     evaluate_surroundings(problem, states)
     if limit == math.inf:
         fill_clearances(problem.scene, problem.outline, states, rooms)
     for lane in range(len(costs)):
-        costs[lane] = price(problem, rooms, states, lane, limit)
+        costs[lane] = plan_cost(problem, rooms, states, lane, limit)
         if limit < math.inf:
             limit = min(limit, costs[lane] + WORTHLESS_MARGIN)
 
@@ -277,17 +277,19 @@ def _copy_lane(plans: Floats, lane: int, to: Floats, to_lane: int) -> None:
 
 
 @lean_kernel
-def _gather(plans: Floats, costs: Floats, origins: NDArray[np.int64], mean: int, best: int) -> None:
-    """Put the weighted mean of the `plans`, and the best of them, into lanes of the last block.
+def _combine(
+    plans: Floats, costs: Floats, origins: NDArray[np.int64], mean: int, best: int
+) -> None:
+    """Put the weighted mean of the `plans`, and the best plan, into lanes of the last block.
 
-    They are summed up by the lanes that they came from, `origins` (n,).
+    Sums are formed by the lanes that the plans come from, `origins` (n,).
     """
-    gathered, top, total = plans[-1], int(NONE), 0.0
+    combined, best_plan, total = plans[-1], int(NONE), 0.0
     for n in range(len(origins)):
-        if costs[n // LANES, n % LANES] < costs[top // LANES, top % LANES]:
-            top = n
-    least = costs[top // LANES, top % LANES]
-    gathered[:] = 0.0
+        if costs[n // LANES, n % LANES] < costs[best_plan // LANES, best_plan % LANES]:
+            best_plan = n
+    least = costs[best_plan // LANES, best_plan % LANES]
+    combined[:] = 0.0
     for n in range(len(origins)):
         worse = costs[n // LANES, n % LANES] - least
         if worse < WORTHLESS_MARGIN:
@@ -296,14 +298,14 @@ def _gather(plans: Floats, costs: Floats, origins: NDArray[np.int64], mean: int,
             for t in range(plans.shape[1]):
                 for axis in range(plans.shape[2]):
                     one = plans[n // LANES, t, axis, n % LANES]
-                    gathered[t, axis, origins[n]] += share * one
+                    combined[t, axis, origins[n]] += share * one
     for t in range(plans.shape[1]):
         for axis in range(plans.shape[2]):
-            sums, amount = gathered[t, axis], 0.0
+            sums, amount = combined[t, axis], 0.0
             for lane in range(LANES):
                 amount += sums[lane]
             sums[mean] = amount / total
-            sums[best] = plans[top // LANES, t, axis, top % LANES]
+            sums[best] = plans[best_plan // LANES, t, axis, best_plan % LANES]
 
 
 def step_duration(model: MotionModel) -> float:
@@ -316,8 +318,8 @@ def mean_past_commands(
 ) -> tuple[Floats, float]:
     """Return the mean command of each past step, and the oldest's share of the next step.
 
-    `sent` (n, 4) are times [s], now being 0, and commands, oldest first. Each holds until the next;
-    `before` precedes them all.
+    `sent` (n, 4) are times [s] relative to now, and commands, oldest first. Each command holds
+    until the next; `before` precedes all of them.
     """
     whole = math.floor(delay / dt + 1e-9)
     ends = np.arange(-whole, 1) * dt

@@ -1,4 +1,4 @@
-"""Lower bounds of a plan's cost, from its last pose alone: most plans need no closer look."""
+"""Lower bounds of a plan's cost from its last pose, which rule out most plans."""
 
 import math
 from typing import NamedTuple
@@ -7,32 +7,32 @@ import numpy as np
 
 from gigabrain_zenoh.kernels.jit import lean_kernel
 from gigabrain_zenoh.navigation.cost import (
-    NEAR_GOAL,
-    SECOND,
+    COST_PER_S,
+    NEAR_GOAL_M,
     contact_cost,
     disc_contact_cost,
-    rest,
+    remaining_cost,
     terminal_cost,
 )
 from gigabrain_zenoh.navigation.footprint import Singles
 from gigabrain_zenoh.navigation.motion_model import InitialState
 from gigabrain_zenoh.navigation.planning_problem import MotionState, Problem
 
-SLACK = 0.01  # of costs, more than rounding errors
+SLACK = 0.01  # cost, above rounding errors
 
 
 class PlanBounds(NamedTuple):
-    """Lower bounds that hold for all plans of a cycle."""
+    """Lower bounds for all plans of a cycle."""
 
     touching: float  # the cost of a plan with a contact
-    spent: float  # the cost of a plan without one, but for its end
+    spent: float  # the cost of a plan without a contact, and without its terminal cost
 
 
 @lean_kernel
 def bounds_of(problem: Problem, start: InitialState, steps: int) -> PlanBounds:
-    """Return the bounds of plans of so many `steps`.
+    """Return the bounds of plans of `steps` steps.
 
-    In each step a body may be anywhere that its speed allows, and that costs time alone.
+    They assume that the body can be anywhere within reach of its speed, and count time only.
     """
     model, _, weights, scene, dt = problem
     speed, field = _fastest(problem, start), scene.field
@@ -43,17 +43,17 @@ def bounds_of(problem: Problem, start: InitialState, steps: int) -> PlanBounds:
     touching, spent, way, ring = math.inf, 0.0, math.inf, 0
     for t in range(1, steps + 1):
         reach = speed * t * dt
-        while ring < reach / field.cell + 3.0:  # with the cells beside, that are interpolated
+        while ring < reach / field.cell + 3.0:  # and the cells used in interpolation
             way = min(way, _least_on_ring(field.distance, row, column, ring))
             ring += 1
-        left = way if away - reach >= NEAR_GOAL else min(way, max(0.0, away - reach))
+        left = way if away - reach >= NEAR_GOAL_M else min(way, max(0.0, away - reach))
         if len(scene.track) > 0:
             left = scene.track[-1, 3]
         contact = contact_cost(t / steps)
         if len(scene.discs) > 0:
             contact = min(contact, disc_contact_cost(weights, t * dt, t / steps))
-        touching = min(touching, spent + SECOND * left / model.forward + contact)
-        spent += 0.5 * SECOND * dt if away - reach > scene.tolerance else 0.0
+        touching = min(touching, spent + COST_PER_S * left / model.forward + contact)
+        spent += 0.5 * COST_PER_S * dt if away - reach > scene.tolerance else 0.0
     return PlanBounds(touching - SLACK, spent - SLACK)
 
 
@@ -63,7 +63,7 @@ def may_cost_less(problem: Problem, bounds: PlanBounds, end: MotionState, limit:
     if bounds.touching < limit:
         return True
     left = limit - bounds.spent
-    way = rest(problem.model, problem.scene, end.at.x, end.at.y, end.yaw)
+    way = remaining_cost(problem.model, problem.scene, end.at.x, end.at.y, end.yaw)
     return way < left and terminal_cost(problem, end) < left
 
 
@@ -80,7 +80,7 @@ def _fastest(problem: Problem, start: InitialState) -> float:
 
 @lean_kernel
 def _least_on_ring(field: Singles, row: int, column: int, ring: int) -> float:
-    """Return the least of the cells that are `ring` rows or columns away, or at the rim."""
+    """Return the least of the cells `ring` rows or columns away, limited to the grid."""
     rows, columns = field.shape
     top, bottom = max(0, row - ring), min(rows - 1, row + ring)
     left, right = max(0, column - ring), min(columns - 1, column + ring)

@@ -1,4 +1,4 @@
-"""The kind of a plan's motion, and its reason in words."""
+"""The kind of a plan's motion, and its reason as text."""
 
 import math
 from typing import Literal
@@ -11,33 +11,33 @@ from gigabrain_zenoh.navigation.motion_model import MotionModel
 
 PlanKind = Literal["going", "going round", "waiting", "backing out", "turning in place", "arrived"]
 
-SOON_S = 1.0  # the motion within this time is reported
-STILL_SHARE = 0.08  # share of the largest speed that counts as standing
-NAMED_WITHIN_M = 1.5  # [m], what moves within this is named
-AT_GOAL_M = 0.2  # [m], so little is left where only standing and turning are
-DETOUR_M = 0.15  # [m], so far off the straight way is round something
+REPORTED_S = 1.0  # motion within this time is reported
+STILL_SHARE = 0.08  # of the maximum speed, below which the body stands still
+MAX_NAMED_M = 1.5  # distance of a moving obstacle that the reason names
+AT_GOAL_M = 0.2  # cost to go, below which a body that stands or turns is at the goal
+DETOUR_M = 0.15  # distance from the straight line, beyond which the body goes round something
 
 
 def classify_plan(model: MotionModel, track: Floats, dt: float, goal: Goal) -> PlanKind:
     """Return the kind of motion of `track` (T + 1, 6) within the next second."""
-    soon = min(len(track) - 1, max(1, round(SOON_S / dt)))
+    soon = min(len(track) - 1, max(1, round(REPORTED_S / dt)))
     begin, end = track[0].tolist(), track[soon].tolist()  # plain numbers are quicker
-    made = math.hypot(end[0] - begin[0], end[1] - begin[1])
+    distance = math.hypot(end[0] - begin[0], end[1] - begin[1])
     turned = abs(end[2] - begin[2])
-    if made < STILL_SHARE * model.forward * soon * dt:
+    if distance < STILL_SHARE * model.forward * soon * dt:
         return "waiting" if turned < STILL_SHARE * model.turning * soon * dt else "turning in place"
     back = (end[0] - begin[0]) * math.cos(begin[2]) + (end[1] - begin[1]) * math.sin(begin[2])
     if model.lateral == 0.0 and back < 0.0:
         return "backing out"
-    return "going round" if _aside(track, goal) > DETOUR_M else "going"
+    return "going round" if _detour(track, goal) > DETOUR_M else "going"
 
 
 def explain_plan(
     kind: PlanKind, track: Floats, discs: Floats, room: float, left: float, *, follows: bool = False
 ) -> str:
-    """Return the reason of a plan as text: `room` [m] around the body, `left` [m] to go.
+    """Return the reason of a plan as text, `room` [m] from obstacles and `left` [m] to go.
 
-    A car `follows` a path that may lead back.
+    A car that `follows` a path may have to reverse on it.
     """
     moving = _nearest_moving(track, discs)
     if left < AT_GOAL_M and not moving and kind in ("waiting", "turning in place"):
@@ -61,7 +61,7 @@ def _nearest_moving(track: Floats, discs: Floats) -> str:
         return ""
     away = np.hypot(discs[:, 0] - track[0, 0], discs[:, 1] - track[0, 1]) - discs[:, 4]
     nearest = int(np.argmin(away))
-    if away[nearest] > NAMED_WITHIN_M:
+    if away[nearest] > MAX_NAMED_M:
         return ""
     dx, dy = discs[nearest, :2] - track[0, :2]
     side = math.remainder(math.atan2(dy, dx) - track[0, 2], math.tau)
@@ -78,12 +78,12 @@ def _side(bearing: float) -> str:
     return "to the left" if bearing > 0 else "to the right"
 
 
-def _aside(track: Floats, goal: Goal) -> float:
-    """Return how far the track leaves the straight line to the goal [m]."""
-    then: list[tuple[float, float]] = track[:, :2].tolist()
-    x, y = then[0]
+def _detour(track: Floats, goal: Goal) -> float:
+    """Return the largest distance of the track from the straight line to the goal [m]."""
+    points: list[tuple[float, float]] = track[:, :2].tolist()
+    x, y = points[0]
     dx, dy = goal.x - x, goal.y - y
     length = math.hypot(dx, dy)
     if length < DETOUR_M:
         return 0.0
-    return max(abs((to_y - y) * dx - (to_x - x) * dy) for to_x, to_y in then) / length
+    return max(abs((to_y - y) * dx - (to_x - x) * dy) for to_x, to_y in points) / length

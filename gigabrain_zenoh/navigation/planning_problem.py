@@ -10,36 +10,36 @@ from gigabrain_zenoh.navigation.motion_model import COSINE, SINE, VX, VY, YAW, M
 
 
 class Scene(NamedTuple):
-    """Everything around the body, and the goal."""
+    """Surroundings of the body, and the goal."""
 
-    grid: DistanceGrid  # distances to what stands still
+    grid: DistanceGrid  # distances to static obstacles
     field: DistanceGrid  # cost to go [m]
     discs: Floats  # (m, 6): x, y [m], velocity x, y [m/s], radius [m] and its growth [m/s]
     goal_x: float  # [m]
     goal_y: float
-    goal_yaw: float  # [rad]; nan where any will do
-    tolerance: float  # [m]
+    goal_yaw: float  # [rad]; nan for any
+    tolerance: float  # [m], of the goal's position
     yaw_tolerance: float  # [rad]
-    track: Floats = no_track()  # (n, 4), that a car follows, see car_track
+    track: Floats = no_track()  # (n, 4), of a car, see `car_track.track_of`
 
 
 class Weights(NamedTuple):
     """Weights of the cost terms."""
 
-    margin: float = 0.03  # [m], nearer than this is a contact
-    near: float = 3.0  # of having obstacles near, per second
-    near_over: float = 0.08  # [m], over which that decays
-    tight: float = 1.5  # of speed in tight places, per second
-    tight_speed: float = 0.45  # [m/s], always allowed
-    tight_rate: float = 4.0  # [1/s], more speed per metre of room
+    margin: float = 0.03  # [m], a smaller clearance is a contact
+    near: float = 3.0  # of nearby obstacles, per second
+    near_over: float = 0.08  # [m], decay length of `near`
+    tight: float = 1.5  # of excess speed in tight places, per (m/s)2 and second
+    tight_speed: float = 0.45  # [m/s], allowed at a clearance of `margin`
+    tight_rate: float = 4.0  # [1/s], additional speed per metre of clearance
     turning: float = 0.02  # per (rad/s)2 and second
-    backwards: float = 1.0  # per m
-    heading: float = 0.8  # of facing away from the goal, in units of the time it takes to turn
-    disc: float = 3.0  # of having moving things near, per second
-    disc_over: float = 0.3  # [m]
-    disc_margin: float = 0.02  # [m]
-    disc_lead: float = 0.0  # [s], so much farther per m/s of a thing's speed
-    trust: float = 0.0  # [s], over which what is foreseen of them fades; 0 where it does not
+    backwards: float = 1.0  # per metre in reverse
+    heading: float = 0.8  # of facing away from the way to the goal, as a share of the turning time
+    disc: float = 3.0  # of nearby moving obstacles, per second
+    disc_over: float = 0.3  # [m], decay length of `disc`
+    disc_margin: float = 0.02  # [m], a smaller distance to a moving obstacle is a contact
+    disc_lead: float = 0.0  # [s], increase of `disc_over` per m/s of the obstacle's speed
+    trust: float = 0.0  # [s], time constant of the trust in predictions; 0: constant trust
 
 
 class Problem(NamedTuple):
@@ -49,7 +49,7 @@ class Problem(NamedTuple):
     outline: Outline
     weights: Weights
     scene: Scene
-    dt: float  # [s], of a step
+    dt: float  # [s], duration of a step
 
 
 class MotionState(NamedTuple):

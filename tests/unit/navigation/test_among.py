@@ -11,7 +11,7 @@ from gigabrain_schemas.body import BodyDescription
 from gigabrain_schemas.brain import Obstacle
 from gigabrain_schemas.tasks import Goal
 from gigabrain_zenoh.navigation import cost, dynamic_obstacles
-from gigabrain_zenoh.navigation.cost import NO_DISC
+from gigabrain_zenoh.navigation.cost import NO_DISC_M
 from gigabrain_zenoh.navigation.footprint import outline_of
 from gigabrain_zenoh.navigation.local_costmap import LocalCostmap, Pose2D
 from gigabrain_zenoh.navigation.local_planner import (
@@ -20,7 +20,15 @@ from gigabrain_zenoh.navigation.local_planner import (
     LocalSettings,
     PlanRequest,
 )
-from gigabrain_zenoh.navigation.motion_model import AWAY, CLOSE, COSINE, LANES, STATE, X, model_of
+from gigabrain_zenoh.navigation.motion_model import (
+    COSINE,
+    DISC_COST,
+    DISC_DISTANCE,
+    LANES,
+    STATE,
+    X,
+    model_of,
+)
 from gigabrain_zenoh.navigation.mppi import Sampler
 from gigabrain_zenoh.navigation.planning_problem import Weights
 from gigabrain_zenoh.qa.bench.barn import drive_functions
@@ -103,8 +111,8 @@ def near(discs: list[tuple[float, ...]], seconds: float) -> tuple[float, float]:
     state[COSINE : COSINE + LANES] = 1.0
     state[X : X + LANES - 1] = 50.0  # the others are elsewhere
     cost.fill_disc_distances(weights, np.array(discs), outline_of(JACKAL.footprint), seconds, state)
-    assert (state[AWAY], state[CLOSE]) == (NO_DISC, 0.0)
-    return float(state[AWAY + LANES - 1]), float(state[CLOSE + LANES - 1])
+    assert (state[DISC_DISTANCE], state[DISC_COST]) == (NO_DISC_M, 0.0)
+    return float(state[DISC_DISTANCE + LANES - 1]), float(state[DISC_COST + LANES - 1])
 
 
 def test_who_is_faster_costs_more_from_the_same_distance() -> None:

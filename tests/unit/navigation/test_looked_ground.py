@@ -14,7 +14,7 @@ from gigabrain_schemas.body import BodyDescription, Camera
 from gigabrain_schemas.tasks import Goal
 from gigabrain_zenoh.decision.navigator import close_up
 from gigabrain_zenoh.geometry.sweep import depth, edges
-from gigabrain_zenoh.navigation.footprint import FAR, DistanceGrid
+from gigabrain_zenoh.navigation.footprint import MAX_DISTANCE_M, DistanceGrid
 from gigabrain_zenoh.navigation.local_costmap import CELL_M, Pose2D
 from gigabrain_zenoh.navigation.local_planner import LOOKING, LocalPlan, PlanRequest
 from gigabrain_zenoh.navigation.looked_ground import MARGIN_M, LookedGround, floor_in_view
@@ -31,7 +31,7 @@ CORNER_M = -SIDE / 2 * CELL_M
 
 
 def open_ground(x: float = CORNER_M, y: float = CORNER_M) -> DistanceGrid:
-    return DistanceGrid(np.full((SIDE, SIDE), FAR, np.float32), CELL_M, x, y)
+    return DistanceGrid(np.full((SIDE, SIDE), MAX_DISTANCE_M, np.float32), CELL_M, x, y)
 
 
 def at(grid: DistanceGrid, x: float, y: float) -> float:
@@ -47,10 +47,10 @@ def looked(
 def test_without_a_believed_camera_nothing_costs_more() -> None:
     ground = LookedGround(BODY, SIDE)
     for names in ((), ("rear",)):
-        assert ground.limited(open_ground(), HERE, names, ()).distance.min() == FAR
+        assert ground.limited(open_ground(), HERE, names, ()).distance.min() == MAX_DISTANCE_M
     assert (
         LookedGround(WAFFLE, SIDE).limited(open_ground(), HERE, ("front",), ()).distance.min()
-        == FAR
+        == MAX_DISTANCE_M
     )
 
 
@@ -186,7 +186,7 @@ def test_a_narrow_gap_is_filled_and_a_wide_one_stays(wide: float, filled: bool) 
     assert at(ground.limited(open_ground(), HERE, (), ()), *place) == pytest.approx(MARGIN_M)
     ground.fill_gaps(HERE)
     found = at(ground.limited(open_ground(), HERE, (), ()), *place)
-    assert found == FAR if filled else found == pytest.approx(MARGIN_M)
+    assert found == MAX_DISTANCE_M if filled else found == pytest.approx(MARGIN_M)
 
 
 class StandingDrive(Drive):

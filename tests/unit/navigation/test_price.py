@@ -8,7 +8,7 @@ import pytest
 
 from gigabrain_schemas.arrays import Floats
 from gigabrain_zenoh.kernels.jit import kernel
-from gigabrain_zenoh.navigation.cost import evaluate_surroundings, fill_clearances, price
+from gigabrain_zenoh.navigation.cost import evaluate_surroundings, fill_clearances, plan_cost
 from gigabrain_zenoh.navigation.dynamic_obstacles import WEIGHTS
 from gigabrain_zenoh.navigation.footprint import DistanceGrid, Outline, outline_of
 from gigabrain_zenoh.navigation.motion_model import (
@@ -54,7 +54,7 @@ def prices(
         fill_clearances(scene, outline, states, rooms)
         for n in range(len(limits)):
             for lane in range(LANES):
-                costs[n, block, lane] = price(problem, rooms, states, lane, limits[n])
+                costs[n, block, lane] = plan_cost(problem, rooms, states, lane, limits[n])
 
 
 def scene(discs: Floats) -> Scene:
