@@ -1,4 +1,4 @@
-"""The path that a car follows: what is left of it from any pose near it."""
+"""The path that a car follows, and the remaining distance from poses near it."""
 
 import math
 
@@ -7,23 +7,23 @@ import numpy as np
 from gigabrain_schemas.arrays import Floats
 from gigabrain_zenoh.kernels.jit import lean_kernel
 
-AHEAD_M = 4.0  # [m] of path that count; what is left behind that is added
-REVERSE_WEIGHT = 1.5  # of a metre in reverse, where one forwards is 1
-OFF_WEIGHT = 2.5  # [m] of path for each metre off it: a car gets back to it by a longer way
-TURN_WEIGHT = 1.5  # [m] of path for each metre of the arc by which it is turned
+AHEAD_M = 4.0  # length of path in a track
+REVERSE_WEIGHT = 1.5  # of a metre in reverse, relative to one forwards
+OFF_WEIGHT = 2.5  # metres of path per metre off it, as a car returns by a longer way
+TURN_WEIGHT = 1.5  # metres of path per metre of the arc by which the car is turned away
 
 
 def no_track() -> Floats:
-    """Return the track of bodies that follow none."""
+    """Return the empty track of other bodies."""
     return np.empty((0, 4))
 
 
 def track_of(
     path: Floats, headings: Floats, pose: tuple[float, float, float], radius: float
 ) -> Floats:
-    """Return the track (n, 4) along a path: x, y [m], yaw [rad] and what is left [m].
+    """Return the track (n, 4) along a path: x, y [m], yaw [rad], remaining distance [m].
 
-    `path` (k, 2) [m] and `headings` (k, 2), see `Path`; it begins at the pose of the path that is
+    For `path` (k, 2) [m] and `headings` (k, 2) see `Path`. The track begins at the pose of the path
     nearest to the car's.
     """
     turn = headings[:, 0] - pose[2]
@@ -41,7 +41,7 @@ def track_of(
 
 @lean_kernel
 def remaining_track(track: Floats, radius: float, x: float, y: float, yaw: float) -> float:
-    """Return what is left [m] from a pose, by way of the best pose of the track."""
+    """Return the remaining distance from a pose, by the best pose of the track [m]."""
     least = math.inf
     for n in range(len(track)):
         dx, dy = track[n, 0] - x, track[n, 1] - y

@@ -1,4 +1,4 @@
-"""Contours that cameras see, as the planners take them: polygons, and a memory for the routes."""
+"""Contours that cameras see: their polygons, and a memory for global paths."""
 
 import math
 from collections.abc import Sequence
@@ -14,10 +14,10 @@ from gigabrain_zenoh.geometry.polygon import edges, spread
 from gigabrain_zenoh.geometry.se2 import from_pose, transform
 from gigabrain_zenoh.navigation.zones import EDGE_STEP
 
-CELL_M = 0.05  # of remembered points
-NEAR_M = 1.5  # of the body, within which perception itself remembers what is there
-FAR_M = 10.0  # beyond, contours do not matter to routes yet
-KEPT_TICKS = 60_000_000_000 // TICK_NS  # a contour that is out of sight
+CELL_M = 0.05  # spacing of remembered points
+NEAR_M = 1.5  # from the body, within which perception itself remembers contours
+FAR_M = 10.0  # contours farther away are ignored
+KEPT_TICKS = 60_000_000_000 // TICK_NS  # of a contour out of sight
 MAX_POINTS = 20_000
 
 
@@ -27,9 +27,9 @@ def placed(contours: Sequence[Contour], pose: Pose) -> tuple[Floats, ...]:
 
 
 def covered(polygons: Sequence[Floats], side: int) -> NDArray[np.bool_]:
-    """Return the cells (side, side) in any of the `polygons` (n, 2), in cells, or that they touch.
+    """Return the cells (side, side) that any of `polygons` (n, 2), in cells, covers or touches.
 
-    All are filled at once, each whichever way round it goes: 128 of them in 3 ms.
+    Corners may be in either order. All polygons are filled at once: 128 of them take 3 ms.
     """
     if not polygons:
         return np.zeros((side, side), np.bool_)
@@ -37,7 +37,7 @@ def covered(polygons: Sequence[Floats], side: int) -> NDArray[np.bool_]:
     doubled = corners[:, 0] * ends[:, 1] - ends[:, 0] * corners[:, 1]
     sign = np.where(np.add.reduceat(doubled, first) < 0, -1, 1).astype(np.int16)
     mask = _inside(corners, ends, np.repeat(sign, np.diff(first, append=len(corners))), side)
-    begin, along = _within(corners, ends, side)
+    begin, along = _clipped_edges(corners, ends, side)
     edge, step = spread(np.ceil(np.abs(along).max(axis=1) / EDGE_STEP).astype(np.intp) + 1)
     share = step * EDGE_STEP / np.maximum(np.abs(along).max(axis=1), EDGE_STEP)[edge]
     points = begin[edge] + np.minimum(share, 1.0)[:, None] * along[edge]
@@ -47,12 +47,12 @@ def covered(polygons: Sequence[Floats], side: int) -> NDArray[np.bool_]:
 
 
 def _inside(corners: Floats, ends: Floats, sign: NDArray[np.int16], side: int) -> NDArray[np.bool_]:
-    """Return the cells (side, side) whose middle is in a polygon, by its winding number."""
+    """Return the cells (side, side) whose middle is inside a polygon, by winding numbers."""
     crossings = np.zeros((side, side + 1), np.int16)  # before a cell's middle
     both = np.ceil(np.stack((corners[:, 1], ends[:, 1])) - 0.5).clip(0, side).astype(np.intp)
-    least, most = both.min(axis=0), both.max(axis=0)
-    edge, rows = spread(most - least)
-    rows += least[edge]
+    first_row, last_row = both.min(axis=0), both.max(axis=0)
+    edge, rows = spread(last_row - first_row)
+    rows += first_row[edge]
     (x, y), (to_x, to_y) = corners[edge].T, ends[edge].T
     at = x + (rows + 0.5 - y) / np.where(to_y == y, 1.0, to_y - y) * (to_x - x)
     columns = np.ceil(at - 0.5).clip(0, side).astype(np.intp)
@@ -61,8 +61,8 @@ def _inside(corners: Floats, ends: Floats, sign: NDArray[np.int16], side: int) -
     return inside
 
 
-def _within(corners: Floats, ends: Floats, side: int) -> tuple[Floats, Floats]:
-    """Return where edges enter the square of `side`, and how they go on in it, (n, 2) each.
+def _clipped_edges(corners: Floats, ends: Floats, side: int) -> tuple[Floats, Floats]:
+    """Clip edges to the square of `side`: return their begins and vectors, (n, 2) each.
 
     Liang and Barsky, A new concept and method for line clipping, ACM TOG 1984.
     """
@@ -77,10 +77,10 @@ def _within(corners: Floats, ends: Floats, side: int) -> tuple[Floats, Floats]:
 
 
 class ContourMemory:
-    """Points (n, 2) [m] in the map that contours cover, or have covered where nobody looks now.
+    """Points (n, 2) [m] of the map that contours cover, also contours out of sight.
 
-    What is near the body or in view of a camera, and no contour any more, is gone. Without that
-    memory a route would lead back through what blocks it as soon as the body has turned away.
+    Points that are near the body or in view of a camera, but in no contour, are removed. Without
+    the memory, a path would lead through an obstacle again as soon as the body has turned away.
     """
 
     def __init__(self) -> None:
@@ -89,7 +89,7 @@ class ContourMemory:
         self._ticks = np.empty(0, np.int64)
 
     def forget(self) -> None:
-        """Forget all."""
+        """Remove all points."""
         self.version += len(self._cells) > 0
         self._cells, self._ticks = self._cells[:0], self._ticks[:0]
 
@@ -102,7 +102,7 @@ class ContourMemory:
     def update(
         self, tick: int, here: Pose, body: BodyDescription, contours: Sequence[Floats]
     ) -> None:
-        """Take in all polygons (n, 2) [m] of the map that are contours now, seen from `here`."""
+        """Update with all present polygons (n, 2) [m], in the map, seen from `here`."""
         if not len(contours) and not len(self._cells):
             return
         fresh = _cells_of(contours, here)
@@ -124,7 +124,7 @@ class ContourMemory:
 
 
 def _cells_of(contours: Sequence[Floats], here: Pose) -> NDArray[np.int64]:
-    """Return the cells (n, 2), columns first, that polygons cover within FAR_M of `here`."""
+    """Return the cells (n, 2: column, row) that polygons cover within FAR_M of `here`."""
     side = round(2 * FAR_M / CELL_M)
     corner = np.floor((np.array((here.x, here.y)) - FAR_M) / CELL_M).astype(np.float64)
     rows, columns = np.nonzero(covered([one / CELL_M - corner for one in contours], side))
@@ -132,7 +132,7 @@ def _cells_of(contours: Sequence[Floats], here: Pose) -> NDArray[np.int64]:
 
 
 def _watched(body: BodyDescription, here: Pose, points: Floats) -> NDArray[np.bool_]:
-    """Return which `points` (n, 2) of the map a body at `here` would have as contours still."""
+    """Return which `points` (n, 2) of the map a body at `here` would see as contours."""
     away = points - (here.x, here.y)
     distance = np.hypot(away[:, 0], away[:, 1])
     bearing = np.arctan2(away[:, 1], away[:, 0]) - here.yaw

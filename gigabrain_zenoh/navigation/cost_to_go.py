@@ -13,14 +13,14 @@ from gigabrain_zenoh.navigation.footprint import DistanceGrid, interpolate
 from gigabrain_zenoh.navigation.zones import fill
 
 COARSER = 2  # cells of the window per cell of the field, along each axis
-FARTHEST = 1e4  # [m], what cannot be reached
-UNIT = 1e-5  # [m], of costs while they are compared: integers take a quarter of the time
-TIGHT, TIGHT_OVER = 12.0, 0.09  # cost of a place where the body just fits, and its decay [m]
-TOUCHING, INSIDE = 60.0, 400.0  # high and finite: a body there must get out
+FARTHEST = 1e4  # [m], cost to go of unreachable cells
+UNIT = 1e-5  # [m], of costs as integers, which take a quarter of the time
+TIGHT, TIGHT_OVER = 12.0, 0.09  # cost per metre where the body just fits, and its decay [m]
+TOUCHING, INSIDE = 60.0, 400.0  # cost per metre in obstacles; finite, so that a body can leave
 
-BEYOND = 1e4  # cost of what is beside the window
+BEYOND = 1e4  # cost per metre beside the window
 DIAGONAL = math.sqrt(2.0)
-HALVINGS = 5  # of an exponent, for the first terms of its series to do
+HALVINGS = 5  # of an exponent, so that few terms of its series are enough
 SECOND, THIRD, FOURTH = np.float32(1 / 2), np.float32(1 / 6), np.float32(1 / 24)
 
 Singles = NDArray[np.float32]
@@ -30,12 +30,12 @@ Units = NDArray[np.int32]
 class Ways(NamedTuple):
     """Cost of ways through traffic, on a coarse grid larger than the window."""
 
-    price: DistanceGrid  # of a metre, 1 where nothing passes
+    price: DistanceGrid  # per metre, 1 without traffic
     field: DistanceGrid  # cost to go [m of free way]
 
 
 class CostToGo:
-    """The cheapest ways over the window, 8-connected, with buffers that are used again."""
+    """Computes the cheapest 8-connected ways over the window. Its buffers are reused."""
 
     def __init__(self, cells: int) -> None:
         side = cells // COARSER
@@ -48,13 +48,15 @@ class CostToGo:
         self, grid: DistanceGrid, half_width: float, goal: tuple[float, float], path: Floats | None,
         ways: Ways | None = None, avoid: Sequence[Floats] = (),
     ) -> DistanceGrid:  # fmt: skip
-        """Return the cost from each place to the goal, or to the path's exit [m of free way].
+        """Return the cost from each cell to the goal, or to the path's exit [m of free way].
 
-        Without a path, and with the goal outside, every place at the rim counts on free way beyond,
-        or on the cost of the `ways` there. Polygons `avoid` (n, 2) [m] cost as much as touching.
+        Without a path to a goal outside, each cell of the rim has the cost of a straight free way
+        from there, or that of `ways`. Polygons `avoid` (n, 2) [m] cost as much as touching.
         """
         cell = grid.cell * COARSER
-        _price(grid.distance, np.float32(half_width), np.float32(cell / 2.0 / UNIT), self._halves)
+        _fill_costs(
+            grid.distance, np.float32(half_width), np.float32(cell / 2.0 / UNIT), self._halves
+        )
         if len(avoid):
             self._raise_costs(avoid, cell, (grid.x, grid.y))
         self._padded.fill(round(FARTHEST / UNIT))
@@ -83,12 +85,13 @@ class CostToGo:
 
 @kernel
 def seed(known: Units, cell: float, corner: tuple[float, float], points: Floats) -> bool:
-    """Put what is known from the start into `known` (side, side), in units; elsewhere stays.
+    """Put the initial costs into `known` (side, side), in units; other cells are unchanged.
 
-    Return whether a part of the path `points` (n, 2) [m], or the goal alone, is inside.
+    The exit of the path `points` (n, 2) [m] has cost 0. If the path is outside, each cell of the
+    rim has the straight distance to its end. Return whether a point of the path is inside.
     """
     side = len(known)
-    last = _way_out(points, cell, corner, side)
+    last = _path_exit(points, cell, corner, side)
     if last >= 0:
         x, y = points[last]
         known[math.floor((y - corner[1]) / cell), math.floor((x - corner[0]) / cell)] = 0
@@ -115,10 +118,10 @@ def _in_metres(units: Units, metres: Singles) -> None:
 
 
 @kernel
-def _way_out(points: Floats, cell: float, corner: tuple[float, float], side: int) -> int:
-    """Return the index of the last of `points` (n, 2) before they leave the window; -1 if all have.
+def _path_exit(points: Floats, cell: float, corner: tuple[float, float], side: int) -> int:
+    """Return the index of the last of `points` (n, 2) before they leave the window.
 
-    It counts from the one that is nearest to the robot, in the middle.
+    The search starts at the point nearest to the middle. The index is -1 if all are outside.
     """
     middle_x, middle_y = corner[0] + side * cell / 2, corner[1] + side * cell / 2
     last, nearest, leads_on = -1, math.inf, False
@@ -137,11 +140,11 @@ def _way_out(points: Floats, cell: float, corner: tuple[float, float], side: int
 
 
 @kernel
-def _price(distance: Singles, half_width: np.float32, half: np.float32, halves: Units) -> None:
-    """Fill `halves` (2, side, side + 2): half the way over each cell, straight and aslant.
+def _fill_costs(distance: Singles, half_width: np.float32, half: np.float32, halves: Units) -> None:
+    """Fill `halves` (2, side, side + 2): half the cost to cross each cell, straight and diagonal.
 
-    `half` is that way where it is free. From the mean distance of COARSER x COARSER cells; the
-    exponential function is written out: so it is vectorised.
+    `half` is that cost in a free cell. The distance is the mean of COARSER x COARSER cells. The
+    exponential function is written out so that it is vectorised.
     """
     side, slant = halves.shape[1], half * np.float32(DIAGONAL)
     for row in range(side):
@@ -152,7 +155,7 @@ def _price(distance: Singles, half_width: np.float32, half: np.float32, halves: 
     one, tight, well_in = np.float32(1.0), np.float32(TIGHT), np.float32(0.6) * half_width
     for row in range(side):
         first, second = distance[2 * row], distance[2 * row + 1]
-        straight, aslant = halves[0, row, 1 : side + 1], halves[1, row, 1 : side + 1]
+        straight, diagonal = halves[0, row, 1 : side + 1], halves[1, row, 1 : side + 1]
         for j in range(side):
             away = (first[2 * j] + first[2 * j + 1] + second[2 * j] + second[2 * j + 1]) * share
             y = (half_width - away) * per_over
@@ -162,12 +165,12 @@ def _price(distance: Singles, half_width: np.float32, half: np.float32, halves: 
             price = one + tight * near
             price = price if away >= half_width else touching
             price = price if away >= well_in else inside
-            straight[j], aslant[j] = np.int32(price * half), np.int32(price * slant)
+            straight[j], diagonal[j] = np.int32(price * half), np.int32(price * slant)
 
 
 @kernel
 def _scale_costs(halves: Units, cell: float, x: float, y: float, ways: Ways) -> None:
-    """Multiply `halves` by what a metre costs there, (x, y) [m] from the corner of the `ways`."""
+    """Multiply `halves` by the price in `ways`, from whose corner they are (x, y) [m] away."""
     price, per_cell = ways.price.distance, 1.0 / ways.price.cell
     for i in range(halves.shape[1]):
         for j in range(halves.shape[1]):
@@ -179,7 +182,7 @@ def _scale_costs(halves: Units, cell: float, x: float, y: float, ways: Ways) -> 
 
 @kernel
 def _seed_rim(known: Units, cell: float, x: float, y: float, ways: Ways) -> None:
-    """Put what is to go from the rim into `known`, (x, y) [m] from the corner of the `ways`."""
+    """Put the cost to go of `ways` into the rim of `known`, (x, y) [m] from their corner."""
     field, per_cell, side = ways.field.distance, 1.0 / ways.field.cell, len(known)
     for i in range(side):
         step = 1 if i in (0, side - 1) else side - 1
@@ -192,48 +195,48 @@ def _seed_rim(known: Units, cell: float, x: float, y: float, ways: Ways) -> None
 def sweep(halves: Units, field: Units, spans: Units) -> None:
     """Lower `field` until each cell is as cheap as by any of its eight neighbours.
 
-    The edge between two costs its length times the mean of their costs. Row by row, down and up,
-    as long as a row beside has changed: what Dijkstra's algorithm finds, in a quarter of its time.
+    A step costs its length times the mean cost of both cells. Rows are lowered one by one, down and
+    up, until none changes. The result is that of Dijkstra's algorithm, in a quarter of its time.
     """
     rows = len(field)
     stale, fresh = np.ones(rows, dtype=np.bool_), np.ones(rows, dtype=np.bool_)
-    going, down = True, True
-    while going:
-        going = False
+    changing, down = True, True
+    while changing:
+        changing = False
         for step in range(rows):
             i = step if down else rows - 1 - step
             if not stale[i]:
                 continue
             stale[i] = False
-            changed = i > 0 and _from_row(halves, field, i - 1, i)
+            changed = i > 0 and _lower_from_row(halves, field, i - 1, i)
             if i < rows - 1:
-                changed |= _from_row(halves, field, i + 1, i)
+                changed |= _lower_from_row(halves, field, i + 1, i)
             if changed or fresh[i]:
-                changed |= _along(halves[0, i], field[i], spans)
+                changed |= _lower_within_row(halves[0, i], field[i], spans)
                 fresh[i] = False
             if changed:
-                going = True
+                changing = True
                 stale[max(0, i - 1)] = stale[min(rows - 1, i + 1)] = True
                 stale[i] = False
         down = not down
 
 
 @kernel
-def _from_row(halves: Units, field: Units, beside: int, i: int) -> bool:
-    """Lower row `i` by steps from the row beside it; whether that changed it.
+def _lower_from_row(halves: Units, field: Units, beside: int, i: int) -> bool:
+    """Lower row `i` by steps from the row `beside`, and return whether it changed.
 
-    Slices, not indices: they are vectorised.
+    Slices are vectorised, indices are not.
     """
     n = field.shape[1]
     known, here = field[beside], field[i, 1 : n - 1]
-    mine, mine_aslant = halves[0, i, 1 : n - 1], halves[1, i, 1 : n - 1]
-    straight, aslant = halves[0, beside, 1 : n - 1], halves[1, beside]
-    a, b, c, p, r = known[: n - 2], known[1 : n - 1], known[2:], aslant[: n - 2], aslant[2:]
+    own, own_diagonal = halves[0, i, 1 : n - 1], halves[1, i, 1 : n - 1]
+    straight, diagonal = halves[0, beside, 1 : n - 1], halves[1, beside]
+    a, b, c, p, r = known[: n - 2], known[1 : n - 1], known[2:], diagonal[: n - 2], diagonal[2:]
     changed = False
     for j in range(n - 2):
         left, right = np.int32(a[j] + p[j]), np.int32(c[j] + r[j])
-        middle = np.int32(b[j] + straight[j] + mine[j])
-        best = np.int32(min(left, right) + mine_aslant[j])
+        middle = np.int32(b[j] + straight[j] + own[j])
+        best = np.int32(min(left, right) + own_diagonal[j])
         best = min(middle, best)
         changed |= best < here[j]
         here[j] = min(best, here[j])
@@ -241,24 +244,24 @@ def _from_row(halves: Units, field: Units, beside: int, i: int) -> bool:
 
 
 @kernel
-def _along(halves: Units, row: Units, spans: Units) -> bool:
-    """Lower `row` by steps within it, to the right and to the left; whether that changed it.
+def _lower_within_row(halves: Units, row: Units, spans: Units) -> bool:
+    """Lower `row` by steps within it, and return whether it changed.
 
-    Both at the same time, for each waits for itself all the way.
+    Both directions are in one loop, as each step depends on the one before it.
     """
     n = len(row)
     first, second = halves[: n - 1], halves[1:]
     steps, right, left = spans[0, : n - 1], spans[1], spans[2]
     for j in range(n - 1):
         steps[j] = first[j] + second[j]
-    forth, back = row[0], row[n - 1]
-    right[0], left[n - 1] = forth, back
+    forward, backward = row[0], row[n - 1]
+    right[0], left[n - 1] = forward, backward
     for j in range(n - 1):
-        forth = min(np.int32(forth + steps[j]), row[j + 1])
-        right[j + 1] = forth
+        forward = min(np.int32(forward + steps[j]), row[j + 1])
+        right[j + 1] = forward
         k = n - 2 - j
-        back = min(np.int32(back + steps[k]), row[k])
-        left[k] = back
+        backward = min(np.int32(backward + steps[k]), row[k])
+        left[k] = backward
     changed = False
     for j in range(n):
         best = min(right[j], left[j])

@@ -1,7 +1,7 @@
-"""Quick bodies among quick obstacles: margins, looking around first, and a map of traffic.
+"""Fast bodies among fast obstacles: margins, looking around first, and a map of traffic.
 
-Obstacles may turn at any moment. Predictions count less the later they are, and paths beside
-places that much passes are cheaper.
+Obstacles may turn at any moment. So the weight of predictions fades with time, and paths through
+traffic cost more.
 """
 
 import math
@@ -20,44 +20,44 @@ from gigabrain_zenoh.navigation.planning_problem import Weights
 
 QUICK_BODY_SPEED = 1.0  # [m/s], a body that can go faster is quick
 QUICK_OBSTACLE_SPEED = 0.3  # [m/s]
-HORIZON_S = 2.0  # of its plans
-LOOK_AROUND_S = 0.6  # before it first drives off: so long it takes to tell what moves
-LOOK_AROUND_IN_TRAFFIC_S = 4.0  # instead, where there is traffic: so long it takes to tell where
-KEEP_AWAY_M = 1.25  # what comes nearer meanwhile it makes way for
+HORIZON_S = 2.0  # of the body's plans
+LOOK_AROUND_S = 0.6  # before the first motion, to find moving obstacles
+LOOK_AROUND_IN_TRAFFIC_S = 4.0  # the same with traffic, to find where it is
+KEEP_AWAY_M = 1.25  # the body makes way for obstacles that come nearer meanwhile
 WEIGHTS = Weights(disc=9.0, disc_lead=0.1, trust=0.7)
 
 CELL_M = 0.5
-CELLS = 128  # along each axis: what is farther off does not matter yet
-RECENTER_CELLS = 8  # that the robot may be off its middle
-PLACE_RADIUS_M = 2.5  # so far round a thing counts as its place, for it may turn
-FADES_S = 30.0  # how long a place is remembered
-UNSURE_S = 0.5  # a place that was watched for so long is known half
-DODGED_SHARE = 0.65  # of the body's own top speed: what is slower it gets out of the way of
-RISK_COST = 1200.0  # [s2/m], what the faster ones cost, by the square of how much faster they are
-MIN_TRAFFIC = 1e-3  # [m/s2], less than that is no traffic
-LONGEST_GAP_S = 1.0  # between scans; in a longer one nothing was watched
+CELLS = 128  # along each axis
+RECENTER_CELLS = 8  # distance of the robot from the middle, before the map is moved
+PLACE_RADIUS_M = 2.5  # around an obstacle, counted as its place because it may turn
+FADES_S = 30.0  # time constant of the memory
+UNSURE_S = 0.5  # added to the time watched, so that short observations count less
+DODGED_SHARE = 0.65  # of the body's top speed: it can dodge slower obstacles
+RISK_COST = 1200.0  # [s2/m], of faster obstacles, by the square of the excess
+MIN_TRAFFIC = 1e-3  # [m/s2], less is no traffic
+MAX_GAP_S = 1.0  # between scans; a longer one counts as not watched
 UPDATE_TICKS = 10  # from map to map
 
-MOVING_SPEED = 0.15  # [m/s], slower things are part of the grid
-MOVING_SIGMAS = 3.0  # standard deviations of its velocity that a thing must be faster than to move
-DEFAULT_SPEED_SIGMA = 0.05  # [m/s], standard deviation of a velocity that comes without
-MOVING_MARGIN_M = 0.1  # [m], from the rim of a disc: the middle of its own contour
-MAX_GROWTH_SPEED = 0.3  # [m/s], of a disc: how fast what is known of it fades at most
+MOVING_SPEED = 0.15  # [m/s], slower obstacles are part of the grid
+MOVING_SIGMAS = 3.0  # the speed of a moving obstacle, in standard deviations, is at least this
+DEFAULT_SPEED_SIGMA = 0.05  # [m/s], standard deviation of a velocity without covariance
+MOVING_MARGIN_M = 0.1  # round a disc, for the middle of its own contour
+MAX_GROWTH_SPEED = 0.3  # [m/s], limit of the growth of a disc's uncertainty
 
 
 def is_quick(model: MotionModel) -> bool:
-    """Return whether a body is fast enough to watch quick obstacles."""
+    """Return whether a body is fast enough for the measures of this module."""
     return model.forward > QUICK_BODY_SPEED
 
 
-def moving_quickly(discs: Floats) -> Floats:
-    """Return the quick ones of the `discs` (m, 6), with velocity x, y [m/s] in columns 2 and 3."""
+def quick_discs(discs: Floats) -> Floats:
+    """Return the quick ones of `discs` (m, 6), with velocity x, y [m/s] in columns 2 and 3."""
     found: Floats = discs[np.hypot(discs[:, 2], discs[:, 3]) > QUICK_OBSTACLE_SPEED]
     return found
 
 
-def standing(polygons: tuple[Floats, ...], discs: Floats) -> tuple[Floats, ...]:
-    """Return the `polygons` (k, 2) [m] whose middle is in none of the `discs` (m, 6) that move."""
+def static_polygons(polygons: tuple[Floats, ...], discs: Floats) -> tuple[Floats, ...]:
+    """Return the `polygons` (k, 2) [m] whose middle is in none of the moving `discs` (m, 6)."""
     if not polygons or not len(discs):
         return polygons
     middles = np.array([polygon.mean(axis=0) for polygon in polygons])
@@ -67,7 +67,7 @@ def standing(polygons: tuple[Floats, ...], discs: Floats) -> tuple[Floats, ...]:
 
 
 def stay_clear(discs: Floats, x: float, y: float) -> bool:
-    """Return whether no disc (m, 6) comes near (x, y) [m] while the body looks around."""
+    """Return whether all `discs` (m, 6) stay KEEP_AWAY_M from (x, y) [m] within HORIZON_S."""
     dx, dy, vx, vy = discs[:, 0] - x, discs[:, 1] - y, discs[:, 2], discs[:, 3]
     nearest = -(dx * vx + dy * vy) / np.maximum(vx * vx + vy * vy, 1e-9)
     when = np.clip(nearest, 0.0, HORIZON_S)
@@ -78,15 +78,15 @@ def stay_clear(discs: Floats, x: float, y: float) -> bool:
 class TrafficMemory(NamedTuple):
     """Fading sums of observations, (CELLS, CELLS) each."""
 
-    passed: Floats  # [m/s]: times, widths and squares of speeds above what counts, per area
-    watched: Floats  # [s]
+    passed: Floats  # [m/s], sum of time x width x square of excess speed, per area
+    watched: Floats  # [s], for which each cell was in sight
 
 
 class TrafficMap:
     """Traffic near a body, in the planning frame."""
 
     def __init__(self, width: float, fastest: float, sight: float) -> None:
-        """Take a body of `width` [m], top speed `fastest` [m/s] and range `sight` [m]."""
+        """Make a map for a body's `width` [m], top speed `fastest` [m/s] and `sight` [m]."""
         self._width, self._fastest, self._sight = width, fastest, sight
         self._memory = _empty_memory()
         self._padded = np.empty((CELLS, CELLS + 2), dtype=np.int32)
@@ -95,9 +95,9 @@ class TrafficMap:
         self.reset()
 
     def reset(self) -> None:
-        """Forget all."""
-        self._row = self._column = self._tick = self._made = 0
-        self._any = False
+        """Forget the traffic."""
+        self._row = self._column = self._tick = self._updated_tick = 0
+        self._has_traffic = False
         self._ways: Ways | None = None
         for cells in self._memory:
             cells.fill(0.0)
@@ -105,34 +105,34 @@ class TrafficMap:
     @property
     def any(self) -> bool:
         """Return whether there is traffic."""
-        return self._any
+        return self._has_traffic
 
-    def see(self, tick: int, x: float, y: float, discs: Floats) -> None:
-        """Take in the moving `discs` (n, 6) round a body at (x, y) [m]."""
-        over = np.minimum(np.hypot(discs[:, 2], discs[:, 3]), self._fastest)
-        over -= DODGED_SHARE * self._fastest
-        counts = over > 0.0
-        if not self._any:
-            if not counts.any():
+    def update(self, tick: int, x: float, y: float, discs: Floats) -> None:
+        """Add the moving `discs` (n, 6) seen from a body at (x, y) [m]."""
+        excess = np.minimum(np.hypot(discs[:, 2], discs[:, 3]), self._fastest)
+        excess -= DODGED_SHARE * self._fastest
+        too_fast = excess > 0.0
+        if not self._has_traffic:
+            if not too_fast.any():
                 return
-            self._any, self._tick, self._made = True, tick, tick
+            self._has_traffic, self._tick, self._updated_tick = True, tick, tick
         dt, self._tick = (tick - self._tick) * TICK_NS / 1e9, tick
-        keeps, seen = math.exp(-dt / FADES_S), dt if dt < LONGEST_GAP_S else 0.0
-        self._follow(x, y)
+        decay, seen = math.exp(-dt / FADES_S), dt if dt < MAX_GAP_S else 0.0
+        self._move_map(x, y)
         left, low = self._column * CELL_M, self._row * CELL_M
-        _add_watched(self._memory, keeps, seen, x - left, y - low, self._sight)
-        amounts = seen * over**2 * (2.0 * discs[:, 4] + self._width)
-        for disc, amount in zip(discs[counts], amounts[counts], strict=True):
-            _pass(self._memory.passed, disc[0] - left, disc[1] - low, amount)
+        _add_watched(self._memory, decay, seen, x - left, y - low, self._sight)
+        amounts = seen * excess**2 * (2.0 * discs[:, 4] + self._width)
+        for disc, amount in zip(discs[too_fast], amounts[too_fast], strict=True):
+            _add_passing(self._memory.passed, disc[0] - left, disc[1] - low, amount)
 
     def ways(self, goal: tuple[float, float]) -> Ways | None:
         """Return the cost of ways to the goal through the traffic; None without traffic."""
-        if self._any and self._tick - self._made >= UPDATE_TICKS:
-            self._made, self._ways = self._tick, self._priced(goal)
-            self._any = self._ways is not None
+        if self._has_traffic and self._tick - self._updated_tick >= UPDATE_TICKS:
+            self._updated_tick, self._ways = self._tick, self._compute_ways(goal)
+            self._has_traffic = self._ways is not None
         return self._ways
 
-    def _priced(self, goal: tuple[float, float]) -> Ways | None:
+    def _compute_ways(self, goal: tuple[float, float]) -> Ways | None:
         rate = self._memory.passed / (self._memory.watched + UNSURE_S)
         if rate.max() < MIN_TRAFFIC:
             return None
@@ -147,14 +147,14 @@ class TrafficMap:
         field = (self._padded[:, 1:-1] * UNIT).astype(np.float32)
         return Ways(DistanceGrid(price, CELL_M, *corner), DistanceGrid(field, CELL_M, *corner))
 
-    def _follow(self, x: float, y: float) -> None:
-        """Keep the robot in the middle; what leaves the map is forgotten."""
+    def _move_map(self, x: float, y: float) -> None:
+        """Move the map with the robot, and forget cells outside."""
         row = math.floor(y / CELL_M) - CELLS // 2
         column = math.floor(x / CELL_M) - CELLS // 2
         down, right = row - self._row, column - self._column
         if max(abs(down), abs(right)) <= RECENTER_CELLS:
             return
-        rows, columns = _shifted(down), _shifted(right)
+        rows, columns = _kept_slices(down), _kept_slices(right)
         moved = _empty_memory()
         for to, cells in zip(moved, self._memory, strict=True):
             to[rows[1], columns[1]] = cells[rows[0], columns[0]]
@@ -165,28 +165,28 @@ def _empty_memory() -> TrafficMemory:
     return TrafficMemory(*np.zeros((2, CELLS, CELLS)))
 
 
-def _shifted(by: int) -> tuple[slice, slice]:
-    """Return the cells that stay when a map moves on, and where they are then."""
+def _kept_slices(by: int) -> tuple[slice, slice]:
+    """Return the old and the new slice of the cells that stay in a map moved by `by`."""
     low, high = max(0, by), max(0, min(CELLS, CELLS + by))
     return slice(low, max(low, high)), slice(max(0, -by), max(0, -by) + max(0, high - low))
 
 
 @kernel
 def _add_watched(
-    memory: TrafficMemory, keeps: float, dt: float, x: float, y: float, sight: float
+    memory: TrafficMemory, decay: float, dt: float, x: float, y: float, sight: float
 ) -> None:
-    """Let `dt` [s] pass, in which what is nearer to (x, y) than `sight` [m] was watched."""
+    """Fade the memory, and add `dt` [s] to cells within `sight` [m] of (x, y)."""
     for i in range(CELLS):
         for j in range(CELLS):
             dx, dy = (j + 0.5) * CELL_M - x, (i + 0.5) * CELL_M - y
             near = dx * dx + dy * dy < sight * sight
-            memory.passed[i, j] *= keeps
-            memory.watched[i, j] = keeps * memory.watched[i, j] + (dt if near else 0.0)
+            memory.passed[i, j] *= decay
+            memory.watched[i, j] = decay * memory.watched[i, j] + (dt if near else 0.0)
 
 
 @kernel
-def _pass(passed: Floats, x: float, y: float, amount: float) -> None:
-    """Add an obstacle at (x, y) [m] to the traffic around its place."""
+def _add_passing(passed: Floats, x: float, y: float, amount: float) -> None:
+    """Add `amount` to the traffic around an obstacle at (x, y) [m]."""
     share = amount / (math.pi * PLACE_RADIUS_M * PLACE_RADIUS_M)
     for i in range(_cell(y - PLACE_RADIUS_M), _cell(y + PLACE_RADIUS_M) + 1):
         for j in range(_cell(x - PLACE_RADIUS_M), _cell(x + PLACE_RADIUS_M) + 1):
@@ -201,7 +201,7 @@ def _cell(at: float) -> int:
 
 
 def discs_of(obstacles: tuple[Obstacle, ...]) -> Floats:
-    """Return moving obstacles (m, 6), with the growth of their uncertainty."""
+    """Return the discs (m, 6) of moving obstacles, see `planning_problem.Scene`."""
     rows = [
         (
             one.x,
@@ -209,16 +209,16 @@ def discs_of(obstacles: tuple[Obstacle, ...]) -> Floats:
             one.velocity_x,
             one.velocity_y,
             one.radius,
-            min(MAX_GROWTH_SPEED, _growth(one)),
+            min(MAX_GROWTH_SPEED, _speed_sigma(one)),
         )
         for one in obstacles
         if math.hypot(one.velocity_x, one.velocity_y)
-        > max(MOVING_SPEED, MOVING_SIGMAS * _growth(one))
+        > max(MOVING_SPEED, MOVING_SIGMAS * _speed_sigma(one))
     ]
     return np.array(rows, dtype=np.float64).reshape(-1, 6)
 
 
-def _growth(obstacle: Obstacle) -> float:
+def _speed_sigma(obstacle: Obstacle) -> float:
     """Return the standard deviation of the velocity [m/s]."""
     if not obstacle.covariance:
         return DEFAULT_SPEED_SIGMA

@@ -1,8 +1,8 @@
 """Local costmap: a window around the robot that remembers recent lidar hits.
 
-A hit marks a cell; two beams that pass it clear it. What no beam can check expires, as odometry
-drifts. Distances are a 5 x 5 chamfer (Borgefors 1986), in a third of the time that
-cv2.distanceTransform takes; it differs in the last bits.
+A hit marks a cell; two scans that see past it clear it. Marks that no beam can check expire, as
+odometry drifts. Distances are those of a 5 x 5 chamfer (Borgefors 1986). It takes a third of the
+time of cv2.distanceTransform, from which it differs in the last bits.
 """
 
 import itertools
@@ -21,31 +21,31 @@ from gigabrain_zenoh.navigation.contours import covered
 from gigabrain_zenoh.navigation.footprint import MAX_DISTANCE_M, DistanceGrid
 from gigabrain_zenoh.navigation.zones import fill
 
-RIM_CELLS = 2  # cells round the window, from which nothing is near
-UNIT = 1 << 20  # of a cell
+RIM_CELLS = 2  # unreached cells round the window, so that steps need no limits
+UNIT = 1 << 20  # length of a cell in integer distances
 STRAIGHT, SLANT, KNIGHT = UNIT, round(1.4 * UNIT), round(2.1969 * UNIT)
 UNREACHED = np.int32(1 << 29)
-WORD, ALL_FREE = 8, np.uint64(0x0101010101010101)  # cells that are looked at together
+WORD, ALL_FREE = 8, np.uint64(0x0101010101010101)  # cells that are compared at once
 FreeCells = NDArray[np.uint8]
 Steps = NDArray[np.int32]
 Singles = NDArray[np.float32]
 Words = NDArray[np.uint64]
 
 CELL_M = 0.025
-BEARING_BINS = 720  # of the bearings round the lidar
-MARK_LEVEL = 2  # of a cell that was just hit; each beam that passes takes one
-BEYOND_M = 0.1  # [m], how far past a cell a beam must go to have passed it
+BEARING_BINS = 720  # round the lidar
+MARK_LEVEL = 2  # of a cell at a hit; each scan whose beams pass it lowers it by one
+BEYOND_M = 0.1  # a beam has passed a cell if it goes this far beyond
 
-DISC_MARGIN_M = 0.1  # [m], hits so near a moving thing are its own
-LATE_TICKS = 10  # so much longer than it seems a disc may have been over a cell
+DISC_MARGIN_M = 0.1  # hits within this distance of a moving disc belong to it
+LATE_TICKS = 10  # tolerance of the time at which a disc began to cover a cell
 
-STATIC_TICKS = 20  # a cell that was hit so long ago, and is now, belongs to what stands
-MAX_STATIC_SHARE = 0.5  # share of its cells that may, of a thing that moves
-RECENTER_SHARE = 0.05  # share of the window that the robot may be off its middle
+STATIC_TICKS = 20  # a cell that stays marked for this long belongs to a static obstacle
+MAX_STATIC_SHARE = 0.5  # of the cells of a moving disc
+RECENTER_SHARE = 0.05  # of the window, distance of the robot from its middle before it is moved
 
 
 class Chamfer:
-    """Distances in windows of (side, side) cells of so many metres, `most` [m] at most."""
+    """Distances in windows of (side, side) cells of size `cell` [m], `most` [m] at most."""
 
     def __init__(self, side: int, cell: float, most: float) -> None:
         self._steps = np.full(
@@ -54,7 +54,7 @@ class Chamfer:
         self._cell, self._most = cell, most
 
     def distance(self, free: FreeCells) -> Singles:
-        """Return the distance of each cell to the nearest 0 in `free`, by their centres [m]."""
+        """Return the distance of each cell's centre to that of the nearest 0 in `free` [m]."""
         distance = np.empty(free.shape, dtype=np.float32)
         _chamfer(free, self._steps, np.float32(self._cell), np.float32(self._most), distance)
         return distance
@@ -64,25 +64,25 @@ class Chamfer:
 def _chamfer(
     free: FreeCells, steps: Steps, cell: np.float32, most: np.float32, distance: Singles
 ) -> None:
-    """Fill `distance` by steps along rows first, then from row to row: their order is free."""
+    """Fill `distance`, by steps within rows first, then from row to row."""
     rows, columns = free.shape
     for row in range(rows):
         here, cells = steps[row + RIM_CELLS, RIM_CELLS : RIM_CELLS + columns], free[row]
         words = cells[: columns // WORD * WORD].view(np.uint64)
-        _along(cells, words, here)
-        _from_beside(steps[row + 1], steps[row], here)
+        _fill_within_row(cells, words, here)
+        _lower_from_rows(steps[row + 1], steps[row], here)
     unit = np.float32(1.0 / UNIT)
     for row in range(rows - 1, -1, -1):
         here, out = steps[row + RIM_CELLS, RIM_CELLS : RIM_CELLS + columns], distance[row]
-        _from_beside(steps[row + RIM_CELLS + 1], steps[row + RIM_CELLS + 2], here)
+        _lower_from_rows(steps[row + RIM_CELLS + 1], steps[row + RIM_CELLS + 2], here)
         for column in range(columns):
             away = np.float32(here[column]) * unit * cell
             out[column] = away if away < most else most
 
 
 @lean_kernel
-def _along(cells: FreeCells, words: Words, here: Steps) -> None:
-    """Fill `here` with the steps within a row to the nearest 0 in `cells`, also in `words`."""
+def _fill_within_row(cells: FreeCells, words: Words, here: Steps) -> None:
+    """Fill `here` with the distance within a row to the nearest 0; `words` is a view of `cells`."""
     n, last = len(cells), -1
     for word in range(len(words) + 1):
         if word < len(words) and words[word] == ALL_FREE:
@@ -91,31 +91,31 @@ def _along(cells: FreeCells, words: Words, here: Steps) -> None:
             if not cells[j]:
                 middle = (last + j + 1) // 2 if last >= 0 else 0
                 if last >= 0:
-                    _rise(here[last:middle])
-                _fall(here[middle : j + 1])
+                    _count_up(here[last:middle])
+                _count_down(here[middle : j + 1])
                 last = j
     if last >= 0:
-        _rise(here[last:])
+        _count_up(here[last:])
     else:
         here[:] = UNREACHED
 
 
 @lean_kernel
-def _rise(here: Steps) -> None:
+def _count_up(here: Steps) -> None:
     for k in range(len(here)):
         here[k] = np.int32(np.int32(k) * STRAIGHT)
 
 
 @lean_kernel
-def _fall(here: Steps) -> None:
+def _count_down(here: Steps) -> None:
     last = np.int32(len(here) - 1)
     for k in range(len(here)):
         here[k] = np.int32(np.int32(last - np.int32(k)) * STRAIGHT)
 
 
 @lean_kernel
-def _from_beside(beside: Steps, beyond: Steps, here: Steps) -> None:
-    """Lower `here` by steps from the two rows on one side. Slices, and 32 bits: vectorised."""
+def _lower_from_rows(beside: Steps, beyond: Steps, here: Steps) -> None:
+    """Lower `here` by steps from the two rows on one side. Slices of int32 are vectorised."""
     n = len(here)
     a, b, c, d, e = beside[:n], beside[1 : n + 1], beside[2 : n + 2], beside[3 : n + 3], beside[4:]
     f, g = beyond[1 : n + 1], beyond[3 : n + 3]
@@ -126,7 +126,7 @@ def _from_beside(beside: Steps, beyond: Steps, here: Steps) -> None:
 
 
 class Pose2D(NamedTuple):
-    """A pose in the frame that is planned in."""
+    """A pose in the planning frame."""
 
     x: float  # [m]
     y: float  # [m]
@@ -134,11 +134,11 @@ class Pose2D(NamedTuple):
 
 
 class WindowCells(NamedTuple):
-    """The window as compiled functions take it, (rows, columns) each."""
+    """The window for kernels, in arrays (rows, columns)."""
 
-    level: NDArray[np.uint8]  # 0 where nothing is
+    level: NDArray[np.uint8]  # 0 in free cells
     seen: NDArray[np.int64]  # tick of the last hit
-    since: NDArray[np.int64]  # tick of the first hit since it was last free
+    since: NDArray[np.int64]  # tick of the first hit since the cell was free
     x: float  # [m], of the corner of cell (0, 0)
     y: float
 
@@ -151,9 +151,9 @@ def observe(
     hits: Floats,
     ticks: tuple[int, int],
 ) -> None:
-    """Mark the hits of a scan, clear cells that its beams have passed, and expire old ones.
+    """Mark the hits of a scan, clear the cells that its beams pass, and expire old cells.
 
-    The `ticks` are that of the scan, and the oldest last hit of a cell that does not expire.
+    `ticks` are the tick of the scan, and the oldest tick of a hit that does not expire.
     """
     level, seen, (tick, oldest) = cells.level, cells.seen, ticks
     cosine, sine = math.cos(place.yaw), math.sin(place.yaw)
@@ -170,8 +170,8 @@ def observe(
         r = math.hypot(x - eye_x, y - eye_y)
         if reach[k] < 0.0 or r < reach[k]:
             reach[k] = r
-    (rows, columns), passed = level.shape, _passed(reach)
-    for n in _marked(level):
+    (rows, columns), passed = level.shape, _least_ranges(reach)
+    for n in _marked_cells(level):
         i, j = n // columns, n % columns
         x = cells.x + (j + 0.5) * CELL_M
         y = cells.y + (i + 0.5) * CELL_M
@@ -191,7 +191,7 @@ def observe(
 
 
 @kernel
-def _marked(level: NDArray[np.uint8]) -> NDArray[np.int64]:
+def _marked_cells(level: NDArray[np.uint8]) -> NDArray[np.int64]:
     """Return the indices of the marked cells (n,), row by row."""
     flat, count = level.reshape(-1), 0
     words = flat[: len(flat) // WORD * WORD].view(np.uint64)
@@ -223,8 +223,8 @@ def _bin(x: float, y: float) -> int:
 
 
 @kernel
-def _passed(reach: Floats) -> Floats:
-    """Return the least range of the beams around each bin [m]; -1 where there are none."""
+def _least_ranges(reach: Floats) -> Floats:
+    """Return the least range of each bin and its neighbours [m]; -1 without beams."""
     passed = np.full(BEARING_BINS, -1.0)
     for k in range(BEARING_BINS):
         for n in (k - 1, k, k + 1):
@@ -235,10 +235,10 @@ def _passed(reach: Floats) -> Floats:
 
 
 @kernel
-def stays(cells: WindowCells, disc: Floats, tick: int, long_ago: int) -> float:
-    """Return the share of a disc's cells hit at `tick` that were hit `long_ago` already."""
+def static_share(cells: WindowCells, disc: Floats, tick: int, static_since: int) -> float:
+    """Return the share of a disc's cells hit at `tick` that were marked by `static_since`."""
     x, y, radius = disc[0], disc[1], disc[4] + DISC_MARGIN_M
-    top, bottom, left, end = _box(cells, x, y, radius)
+    top, bottom, left, end = _cells_around(cells, x, y, radius)
     hit = old = 0
     for i in range(top, bottom):
         down = cells.y + (i + 0.5) * CELL_M - y
@@ -246,15 +246,16 @@ def stays(cells: WindowCells, disc: Floats, tick: int, long_ago: int) -> float:
             near = math.hypot(cells.x + (j + 0.5) * CELL_M - x, down) <= radius
             if near and cells.level[i, j] > 0 and cells.seen[i, j] == tick:
                 hit += 1
-                old += cells.since[i, j] <= long_ago
+                old += cells.since[i, j] <= static_since
     return old / hit if hit else 0.0
 
 
 @kernel
-def take_back(cells: WindowCells, disc: Floats, tick: int) -> None:
-    """Free the cells that were first hit after `disc` had come to be over them."""
+def clear_track(cells: WindowCells, disc: Floats, tick: int) -> None:
+    """Free the cells that were first hit after `disc` began to cover them."""
     x, y, vx, vy, radius = disc[0], disc[1], disc[2], disc[3], disc[4] + DISC_MARGIN_M
-    square, (top, bottom, left, end) = max(vx * vx + vy * vy, 1e-6), _box(cells, x, y, radius)
+    top, bottom, left, end = _cells_around(cells, x, y, radius)
+    square = max(vx * vx + vy * vy, 1e-6)
     for i in range(top, bottom):
         down = cells.y + (i + 0.5) * CELL_M - y
         for j in range(left, end):
@@ -267,8 +268,10 @@ def take_back(cells: WindowCells, disc: Floats, tick: int) -> None:
 
 
 @kernel
-def _box(cells: WindowCells, x: float, y: float, radius: float) -> tuple[int, int, int, int]:
-    """Return the cells that a disc may touch: first row, row after the last; same of columns."""
+def _cells_around(
+    cells: WindowCells, x: float, y: float, radius: float
+) -> tuple[int, int, int, int]:
+    """Return the first row and the row after the last that a disc may touch, then the columns."""
     rows, columns = cells.level.shape
     top, bottom = (y - radius - cells.y) / CELL_M, (y + radius - cells.y) / CELL_M
     left, end = (x - radius - cells.x) / CELL_M, (x + radius - cells.x) / CELL_M
@@ -281,46 +284,48 @@ def _box(cells: WindowCells, x: float, y: float, radius: float) -> tuple[int, in
 
 
 class LocalCostmap:
-    """A square of `size` [m] round the robot, its axes those of the frame that is planned in."""
+    """A square of side `size` [m] round the robot, aligned with the planning frame."""
 
     def __init__(self, size: float, memory_s: float) -> None:
         self.cells = 2 * round(size / CELL_M / 2)
         self._chamfer = Chamfer(self.cells, CELL_M, MAX_DISTANCE_M)
         self._memory = round(memory_s * 1e9 / TICK_NS)
-        self._held, self._spare = _nothing(self.cells), _nothing(self.cells)
-        self._row = self._column = 0  # of cell (0, 0), counted from the frame's origin
+        self._window, self._spare = _empty_window(self.cells), _empty_window(self.cells)
+        self._row = self._column = 0  # of the window's first cell, counted from the frame's origin
         self._empty = True
 
     @property
     def x(self) -> float:
-        """The corner of the window [m]."""
+        """The lower x of the window [m]."""
         return self._column * CELL_M
 
     @property
     def y(self) -> float:
-        """The corner of the window [m]."""
+        """The lower y of the window [m]."""
         return self._row * CELL_M
 
-    def see(self, tick: int, place: Pose2D, lidar: tuple[float, float], hits: Floats) -> None:
-        """Take in a scan: `hits` (n, 2) [m] in the body's frame, the `lidar` at (x, y) in it."""
-        self._follow(place)
-        observe(self._held, place, lidar, hits, (tick, tick - self._memory))
+    def add_scan(self, tick: int, place: Pose2D, lidar: tuple[float, float], hits: Floats) -> None:
+        """Add a scan: `hits` (n, 2) [m] and position (x, y) of the `lidar` in the body's frame."""
+        self._move_window(place)
+        observe(self._window, place, lidar, hits, (tick, tick - self._memory))
 
     def moving(self, tick: int, discs: Floats) -> Floats:
-        """Return the `discs` (n, 6), with x, y [m] first and the radius fifth, that really move.
+        """Return the `discs` (n, 6) that really move: x, y [m] in columns 0, 1, radius in 4.
 
-        A moving disc hits cells that were free a moment ago. Posts and corners mistaken for one
-        another seem to move, but keep hitting the same cells.
+        A moving disc marks cells that were free a moment ago. Posts and corners that are mistaken
+        for one another seem to move, but mark the same cells in each scan.
         """
         if not len(discs):
             return discs
-        held, long_ago = self._held, tick - STATIC_TICKS
-        return discs[[stays(held, disc, tick, long_ago) <= MAX_STATIC_SHARE for disc in discs]]
+        held, static_since = self._window, tick - STATIC_TICKS
+        return discs[
+            [static_share(held, disc, tick, static_since) <= MAX_STATIC_SHARE for disc in discs]
+        ]
 
-    def take_back(self, tick: int, discs: Floats) -> None:
-        """Free what each of `discs` (n, 6) covered on its way here: nothing stands there."""
+    def clear_tracks(self, tick: int, discs: Floats) -> None:
+        """Free the cells that each of `discs` (n, 6) marked on its way."""
         for disc in discs:
-            take_back(self._held, disc, tick)
+            clear_track(self._window, disc, tick)
 
     def grid(
         self,
@@ -331,20 +336,19 @@ class LocalCostmap:
         body: Floats | None = None,
         contours: Sequence[Floats] = (),
     ) -> DistanceGrid:
-        """Return distances to the nearest obstacle, seen or among the `known` points (n, 2) [m].
+        """Return distances to the nearest mark or `known` point (n, 2) [m].
 
-        Recent hits on one of the discs `moving` do not count: it will be elsewhere soon. Polygons
-        `keepouts` and `contours` (m, 2) [m] are obstacles; those that a point of the `body` (k, 2)
-        [m] is in only where it would be farther inside. So it can leave, and sees the obstacles in
-        there.
+        Recent hits on discs `moving` do not count, as they move on. Polygons `keepouts` and
+        `contours` (m, 2) [m] are obstacles. If points of the `body` (k, 2) [m] are inside one, only
+        the cells that are deeper inside count. So the body can leave, and avoids obstacles inside.
         """
-        free = (self._held.level == 0).view(np.uint8)
+        free = (self._window.level == 0).view(np.uint8)
         if len(moving):
             near = np.zeros_like(free)
             for x, y, radius in moving[:, [0, 1, 4]].tolist():
                 column, row = round((x - self.x) / CELL_M), round((y - self.y) / CELL_M)
                 fill_disc(near, row, column, math.ceil((radius + DISC_MARGIN_M) / CELL_M))
-            free |= near & (self._held.since > tick - STATIC_TICKS)
+            free |= near & (self._window.since > tick - STATIC_TICKS)
         if len(known):
             cells = np.floor((known - (self.x, self.y)) / CELL_M).astype(np.int64)
             cells = cells[((cells >= 0) & (cells < self.cells)).all(axis=1)]
@@ -356,7 +360,7 @@ class LocalCostmap:
     def _keep_out(
         self, keepouts: Sequence[Floats], contours: Sequence[Floats], body: Floats | None
     ) -> NDArray[np.bool_]:
-        """Return the cells (side, side) that zones and contours keep the body out of."""
+        """Return the cells (side, side) of zones and contours that the body must not enter."""
         zones = np.zeros((self.cells, self.cells), np.uint8)
         for corners in keepouts:
             fill(zones, (corners - (self.x, self.y)) / CELL_M, 1)
@@ -375,21 +379,21 @@ class LocalCostmap:
         keep_out: NDArray[np.bool_] = (zones > 0) & (~entered | (depth > deepest))
         return keep_out
 
-    def _follow(self, place: Pose2D) -> None:
-        """Keep the robot in the middle; what leaves the window is forgotten."""
+    def _move_window(self, place: Pose2D) -> None:
+        """Move the window with the robot, and forget cells outside."""
         half = self.cells // 2
         row = math.floor(place.y / CELL_M) - half
         column = math.floor(place.x / CELL_M) - half
         down, right = row - self._row, column - self._column
         if max(abs(down), abs(right)) <= RECENTER_SHARE * self.cells and not self._empty:
             return
-        _carry(self._held, self._spare, down, right)
+        _copy_moved(self._window, self._spare, down, right)
         self._row, self._column, self._empty = row, column, False
-        self._held, self._spare = self._spare._replace(x=self.x, y=self.y), self._held
+        self._window, self._spare = self._spare._replace(x=self.x, y=self.y), self._window
 
 
 def fill_disc(cells: FreeCells, row: int, column: int, radius: int) -> None:
-    """Set the cells within `radius` cells of one, as far as they are there."""
+    """Set the cells within `radius` cells of (row, column) to 1."""
     top, left = max(row - radius, 0), max(column - radius, 0)
     part = cells[top : max(row + radius + 1, 0), left : max(column + radius + 1, 0)]
     y = np.arange(part.shape[0])[:, None] + top - row
@@ -398,7 +402,7 @@ def fill_disc(cells: FreeCells, row: int, column: int, radius: int) -> None:
 
 
 def _parts_at(mask: NDArray[np.bool_], indices: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Return those connected parts of `mask` (h, w) that hold one of the cells `indices` (n,)."""
+    """Return the connected parts of `mask` (h, w) that contain one of the cells `indices` (n,)."""
     cells, begins = connected_parts(mask)
     found = np.zeros(mask.size, np.bool_)
     for begin, end in itertools.pairwise(begins.tolist()):
@@ -407,18 +411,18 @@ def _parts_at(mask: NDArray[np.bool_], indices: NDArray[np.int64]) -> NDArray[np
     return found.reshape(mask.shape)
 
 
-def _nothing(side: int) -> WindowCells:
+def _empty_window(side: int) -> WindowCells:
     ticks = np.zeros((2, side, side), dtype=np.int64)
     return WindowCells(np.zeros((side, side), dtype=np.uint8), ticks[0], ticks[1], 0.0, 0.0)
 
 
-def _carry(cells: WindowCells, to: WindowCells, down: int, right: int) -> None:
-    """Fill `to` with what a window over `cells` sees that has moved on by so many of them."""
+def _copy_moved(cells: WindowCells, to: WindowCells, down: int, right: int) -> None:
+    """Fill `to` with `cells`, after the window has moved by `down` rows and `right` columns."""
     side = len(cells.level)
-    at = np.array(divmod(_marked(cells.level), side))
+    at = np.array(divmod(_marked_cells(cells.level), side))
     then = at - np.array([[down], [right]])
-    stays = ((then >= 0) & (then < side)).all(axis=0)
-    (i, j), (row, column) = at[:, stays], then[:, stays]
+    inside = ((then >= 0) & (then < side)).all(axis=0)
+    (i, j), (row, column) = at[:, inside], then[:, inside]
     to.level.fill(0)
     to.level[row, column] = cells.level[i, j]
     to.seen[row, column], to.since[row, column] = cells.seen[i, j], cells.since[i, j]

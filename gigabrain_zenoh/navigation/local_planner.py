@@ -33,33 +33,33 @@ from gigabrain_zenoh.navigation.mppi import SampledPlan, Sampler, mean_past_comm
 from gigabrain_zenoh.navigation.plan_reason import PlanKind, classify_plan, explain_plan
 from gigabrain_zenoh.navigation.planning_problem import Scene, Weights
 
-TURN_COST_SHARE = 1.0  # of time, at full turn, where a strafing body has a heading to keep
-STUCK_RADIUS_M = 0.3  # [m], who gets no farther than this is in one place
-SLOW_PATIENCE = 2.0  # times as long as a speed zone makes it take to get out of one place
-LOOK_AFTER_S, LOOK_UNTIL_S = 2.0, 8.0  # in one place: it tries to see the ground on its way,
-LOOK_EVERY_S = 12.0  # again and again
-WAY_ON_M = 0.4  # [m], distance of the point of its path that it turns to
-FACES_RAD = 0.35  # [rad], off its heading by which that point is in view
-BACK_M = 0.3  # [m], by which it backs off from ground that is too near to be in view
+TURN_COST_SHARE = 1.0  # of the cost of time, at full turn, for strafing bodies with a goal yaw
+STUCK_RADIUS_M = 0.3  # a body within this radius is in one place
+SLOW_PATIENCE = 2.0  # times the time to leave the radius at the speed of a speed zone
+LOOK_AFTER_S, LOOK_UNTIL_S = 2.0, 8.0  # time in one place in which the body looks at the ground
+LOOK_EVERY_S = 12.0  # then again
+WAY_ON_M = 0.4  # distance of the point of the path that it looks at
+FACES_RAD = 0.35  # heading error at which that point is in view
+BACK_M = 0.3  # distance by which it backs off from ground too near to be in view
 LOOKING = "looking: it has not seen the ground on its way"
 MAKING_WAY = "making way: it looks round for what moves"
 STANDARD = Weights()
-ARRIVED_SPEED_SHARE = 0.05  # share of the largest speeds at which a body has arrived
+ARRIVED_SPEED_SHARE = 0.05  # of the maximum speeds, at which a body has arrived
 
 
 class LocalSettings(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Settings of the local planner."""
 
     samples: Annotated[int, Meta(ge=64, le=20_000)] = 1000  # plans per cycle
-    steps: Annotated[int, Meta(ge=10, le=60)] = 30  # of 0.05 s for quick bodies, 0.1 s for slow
-    window: Annotated[float, Meta(ge=2.0, le=20.0)] = 8.0  # [m], side of what is looked at
-    memory: Positive = 10.0  # [s], how long what no beam can check is believed
-    linear_speed: Positive | None = None  # [m/s], no faster; the body's own limit holds as well
+    steps: Annotated[int, Meta(ge=10, le=60)] = 30  # of 0.05 s for fast bodies, 0.1 s for slow ones
+    window: Annotated[float, Meta(ge=2.0, le=20.0)] = 8.0  # [m], side of the local costmap
+    memory: Positive = 10.0  # [s], for which marks that no beam can check are kept
+    linear_speed: Positive | None = None  # [m/s], limit besides the body's own
     aggressiveness: Fraction = 0.5  # see `weights_of` and `model_of`; 1: fast in tight places
-    near_over: Positive = STANDARD.near_over  # [m], over which the cost of obstacles falls to 1/e
+    near_over: Positive = STANDARD.near_over  # [m], decay length of the cost of obstacles
     position_tolerance: Positive = 0.1  # [m]
     yaw_tolerance: Positive = 0.1  # [rad]
-    stuck_after: Positive = 5.0  # [s] in one place, then another way is wanted
+    stuck_after: Positive = 5.0  # [s] in one place, before another path is wanted
     seed: Annotated[int, Meta(ge=0, le=2**32)] = 0
 
 
@@ -69,8 +69,8 @@ DEFAULTS = LocalSettings()
 def weights_of(settings: LocalSettings, base: Weights = STANDARD) -> Weights:
     """Return the weights of a planner's costs.
 
-    An aggressiveness of 1 halves the cost of obstacles near by and doubles the speed in tight
-    places; 0 does the opposite. What counts as a contact stays.
+    An aggressiveness of 1 halves the cost of nearby obstacles and doubles the speed in tight
+    places; 0 does the opposite. The distance of a contact does not change.
     """
     factor = 2.0 ** (2.0 * settings.aggressiveness - 1.0)
     return base._replace(
@@ -88,27 +88,27 @@ def no_points() -> Floats:
 
 @dataclass(frozen=True, kw_only=True)
 class PlanRequest:
-    """Inputs of the local planner, in the odometry frame, which does not jump."""
+    """Inputs of the local planner, in the odometry frame, as it does not jump."""
 
     tick: int  # of the scan
     pose: Pose  # of that tick
     velocity: Velocity  # measured at that tick
     goal: Goal
     hits: Floats  # (n, 2) [m], in the body's frame
-    path: Floats | None = None  # (k, 2) [m], to the goal; without one it looks for its own
+    path: Floats | None = None  # (k, 2) [m], to the goal; None: the planner finds one in its window
     headings: Floats | None = None  # (k, 2), of a car's path, see `Path`
-    known: Floats = field(default_factory=no_points)  # (m, 2) [m], obstacles of the map near by
+    known: Floats = field(default_factory=no_points)  # (m, 2) [m], nearby obstacles of the map
     obstacles: tuple[Obstacle, ...] = ()
-    contours: tuple[Floats, ...] = ()  # polygons (k, 2) [m] of what cameras see now
-    cameras: tuple[str, ...] = ()  # names of those that are believed
+    contours: tuple[Floats, ...] = ()  # polygons (k, 2) [m] that cameras see now
+    cameras: tuple[str, ...] = ()  # names of the trusted ones
     keepouts: tuple[Floats, ...] = ()  # polygons (k, 2) [m] that the body must not enter
-    avoid: tuple[Floats, ...] = ()  # polygons (k, 2) [m] that no way should lead through
-    max_speed: float | None = None  # [m/s], of a speed zone; the other limits hold as well
-    tolerance: float | None = None  # [m], from the goal at which it is reached; None: the settings'
+    avoid: tuple[Floats, ...] = ()  # polygons (k, 2) [m] that cost as much as touching an obstacle
+    max_speed: float | None = None  # [m/s], of a speed zone
+    tolerance: float | None = None  # [m], of the goal's position; None: as in the settings
     response: ActuationModel = field(default_factory=ActuationModel)
     sent: tuple[SentCommand, ...] = ()  # oldest first; those of the last 0.5 s are enough
-    delayed: float = 0.0  # [s], how much later than usual what is planned will be obeyed
-    may_back: bool = True  # else something is behind it, or it cannot see there
+    delayed: float = 0.0  # [s], additional delay of the commands
+    may_back: bool = True  # False if an obstacle is behind, or it cannot see there
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -116,16 +116,16 @@ class LocalPlan:
     """A twist to command, the expected trajectory, and the reason."""
 
     twist: Velocity  # to command now
-    trajectory: tuple[TrajectoryPoint, ...]  # expected, in the body's frame of that tick
+    trajectory: tuple[TrajectoryPoint, ...]  # expected, in the body's frame at the request's tick
     kind: PlanKind
-    reason: str  # in words, for people
-    blocked: bool = False  # nothing has come of it for a while: another way is wanted
+    reason: str  # text for people
+    blocked: bool = False  # the body is stuck: another path is wanted
     arrived: bool = False
     remaining: float = 0.0  # [m of free way], cost to go from here
 
 
 class LocalPlanner:
-    """Plans for one body. It keeps a costmap and the last plan, and no clock."""
+    """Plans for one body. It keeps a costmap and the last plan, but has no clock."""
 
     def __init__(self, body: BodyDescription, settings: LocalSettings = DEFAULTS) -> None:
         self._body, self._settings = body, settings
@@ -141,9 +141,9 @@ class LocalPlanner:
         self.reset()
 
     def configure(self, body: BodyDescription, settings: LocalSettings) -> None:
-        """Use other limits, or other settings than window and memory, from now on.
+        """Change limits, or settings except window and memory.
 
-        What was seen and planned is kept. The body must have its footprint and lidar still.
+        The costmap and the last plan are kept. Footprint and lidar must not change.
         """
         self._body, self._settings = body, settings
         self._model = model_of(body, settings.linear_speed, settings.aggressiveness)
@@ -164,7 +164,7 @@ class LocalPlanner:
         return dynamic_obstacles.TrafficMap(2.0 * self._half_width, model.forward, sight)
 
     def reset(self) -> None:
-        """Discard the costmap and the last plan, as the odometry has restarted."""
+        """Discard the costmap and the last plan, when the odometry has restarted."""
         self._window = LocalCostmap(self._settings.window, self._settings.memory)
         self._costs = CostToGo(self._window.cells)
         self._ground = LookedGround(self._body, self._window.cells)
@@ -172,11 +172,11 @@ class LocalPlanner:
         if self._traffic:
             self._traffic.reset()
         self._tick: int | None = None
-        self._began = 0
+        self._first_tick = 0
         self._anchor, self._anchor_tick = Pose(x=0.0, y=0.0, yaw=0.0), 0
 
     def plan(self, request: PlanRequest) -> LocalPlan:
-        """Plan the motion from then on. Raises ValueError for a goal that is not finite."""
+        """Plan the motion from the request's tick. Raise ValueError if the goal is not finite."""
         goal = request.goal
         if not all(math.isfinite(v) for v in (goal.x, goal.y, goal.yaw or 0.0)):
             raise ValueError(f"a goal has finite numbers, got {goal}")
@@ -184,23 +184,23 @@ class LocalPlanner:
         place = Pose2D(request.pose.x, request.pose.y, request.pose.yaw)
         discs = dynamic_obstacles.discs_of(request.obstacles)
         hits = np.ascontiguousarray(request.hits, dtype=np.float64)
-        self._window.see(request.tick, place, self._lidar, hits)
+        self._window.add_scan(request.tick, place, self._lidar, hits)
         discs = self._window.moving(request.tick, discs)
         model = slowed_model(self._model, request.max_speed)
-        weights = self._look_out(request.tick, place, discs, model)
+        weights = self._update_traffic(request.tick, place, discs, model)
         if self._at_goal(request):
             if not self._turns(request.velocity):
                 return _standing("arrived: at the goal", arrived=True)
             if goal.yaw is None:
                 return _standing("waiting: at the goal")
-        looks_round = self._looks_round(request.tick)
-        if looks_round:
+        looking_round = self._is_looking_round(request.tick)
+        if looking_round:
             if weights is self._weights or dynamic_obstacles.stay_clear(discs, place.x, place.y):
                 return _standing("waiting: it looks round for what moves")
             request = replace(request, goal=Goal(x=place.x, y=place.y), path=None, headings=None)
-        lookout = self._lookout(request, place)
-        if lookout:
-            request = replace(request, goal=lookout, path=None, headings=None)
+        viewpoint = self._viewpoint(request, place)
+        if viewpoint:
+            request = replace(request, goal=viewpoint, path=None, headings=None)
         if self._model.strafes and request.goal.yaw is not None:
             weights = weights._replace(
                 turning=TURN_COST_SHARE * COST_PER_S / self._model.turning**2
@@ -215,44 +215,46 @@ class LocalPlanner:
             self._start(request, place),
         )
         answer = self._answer(request, scene, planned)
-        if lookout:
+        if viewpoint:
             return replace(answer, reason=LOOKING)
-        return replace(answer, reason=MAKING_WAY) if looks_round else answer
+        return replace(answer, reason=MAKING_WAY) if looking_round else answer
 
-    def _look_out(self, tick: int, place: Pose2D, discs: Floats, model: MotionModel) -> Weights:
-        """Get ready for what moves: a quick body among quick things plans in another way."""
-        quick = dynamic_obstacles.moving_quickly(discs) if self._traffic else discs[:0]
+    def _update_traffic(
+        self, tick: int, place: Pose2D, discs: Floats, model: MotionModel
+    ) -> Weights:
+        """Update the traffic, and return the weights. They differ for fast bodies in traffic."""
+        quick = dynamic_obstacles.quick_discs(discs) if self._traffic else discs[:0]
         if self._traffic:
-            self._traffic.see(tick, place.x, place.y, quick)
+            self._traffic.update(tick, place.x, place.y, quick)
         if not len(quick):
             self._sampler.step_by(step_duration(model))
             return self._weights
-        self._window.take_back(tick, quick)
+        self._window.clear_tracks(tick, quick)
         self._sampler.step_by(dynamic_obstacles.HORIZON_S / self._settings.steps)
         return weights_of(self._settings, dynamic_obstacles.WEIGHTS)
 
-    def _looks_round(self, tick: int) -> bool:
-        """Return whether a quick body must still watch for obstacles before it drives off."""
+    def _is_looking_round(self, tick: int) -> bool:
+        """Return whether a fast body must still look for moving obstacles before it drives."""
         if not self._traffic:
             return False
         traffic, alone = dynamic_obstacles.LOOK_AROUND_IN_TRAFFIC_S, dynamic_obstacles.LOOK_AROUND_S
-        return (tick - self._began) * TICK_S < (traffic if self._traffic.any else alone)
+        return (tick - self._first_tick) * TICK_S < (traffic if self._traffic.any else alone)
 
-    def _lookout(self, request: PlanRequest, place: Pose2D) -> Goal | None:
-        """Return where a body that gets no farther sees the ground on its way; None if it need not.
+    def _viewpoint(self, request: PlanRequest, place: Pose2D) -> Goal | None:
+        """Return the pose from which a stuck body sees the ground ahead; None if not needed.
 
-        It turns there first; if the ground is too near to be in view, it backs off. A plan that
-        leads over such ground costs less the later it begins, so without this it is put off.
+        It turns first. If the ground is too near to be in view, it backs off. Without this it would
+        wait, as driving over unseen ground costs less the later it begins.
         """
-        waits_s = self._waits_s(request) % LOOK_EVERY_S
+        waited_s = self._time_in_place_s(request) % LOOK_EVERY_S
         differential = self._model.lateral == 0.0 and self._model.radius == 0.0
-        if not differential or not LOOK_AFTER_S < waits_s < LOOK_UNTIL_S:
+        if not differential or not LOOK_AFTER_S < waited_s < LOOK_UNTIL_S:
             return None
         path = request.path if request.path is not None else no_points()
         ahead = path[np.hypot(path[:, 0] - place.x, path[:, 1] - place.y) > WAY_ON_M]
         x, y = ahead[0].tolist() if len(ahead) else (request.goal.x, request.goal.y)
         bearing = math.atan2(y - place.y, x - place.x)
-        if not self._ground.hides(place, bearing, self._half_width):
+        if not self._ground.is_unseen_ahead(place, bearing, self._half_width):
             return None
         faces = abs(math.remainder(bearing - place.yaw, math.tau)) < FACES_RAD
         back = BACK_M if faces else 0.0
@@ -261,8 +263,8 @@ class LocalPlanner:
 
     def _scene(self, request: PlanRequest, discs: Floats) -> Scene:
         goal = request.goal
-        seen = dynamic_obstacles.standing(request.contours, discs)
-        inside = request.keepouts or seen  # then the body may be in one of them
+        seen = dynamic_obstacles.static_polygons(request.contours, discs)
+        inside = request.keepouts or seen  # the body may be in one of them
         body = transform(from_pose(request.pose), self._rim) if inside else None
         grid = self._window.grid(request.tick, request.known, discs, request.keepouts, body, seen)
         place = Pose2D(request.pose.x, request.pose.y, request.pose.yaw)
@@ -277,7 +279,7 @@ class LocalPlanner:
         return Scene(looked, field, discs, goal.x, goal.y, yaw, near, turned, self._track(request))
 
     def _track(self, request: PlanRequest) -> Floats:
-        """Return what a car follows; other bodies go by the cost to go alone."""
+        """Return the track of a car; other bodies follow the cost to go only."""
         if request.path is None or request.headings is None:
             return no_track()
         pose = request.pose
@@ -287,14 +289,14 @@ class LocalPlanner:
 
     def _start(self, request: PlanRequest, place: Pose2D) -> InitialState:
         v, sent, dt = request.velocity, request.sent, self._sampler.dt
-        times = [((one.tick - request.tick) * TICK_S, *_axes(one.velocity)) for one in sent]
+        times = [((one.tick - request.tick) * TICK_S, *_twist_tuple(one.velocity)) for one in sent]
         rows = np.array([row for row in times if row[0] <= 0.0]).reshape(-1, 4)
         gain = request.response.turn_gain
-        rows[:, 3] *= gain  # what the floor makes of it; control undoes that in what is to come
-        before = tuple(rows[-1, 1:].tolist()) if len(rows) else _axes(v)
-        past, share = mean_past_commands(rows, _axes(v), request.response.delay, dt)
+        rows[:, 3] *= gain  # as the floor changes it; control corrects future commands only
+        before = tuple(rows[-1, 1:].tolist()) if len(rows) else _twist_tuple(v)
+        past, share = mean_past_commands(rows, _twist_tuple(v), request.response.delay, dt)
         lag = first_order_lag(request.response.lag, dt)
-        return InitialState(*place, *_axes(v), before, past, share, lag, gain)
+        return InitialState(*place, *_twist_tuple(v), before, past, share, lag, gain)
 
     def _answer(self, request: PlanRequest, scene: Scene, planned: SampledPlan) -> LocalPlan:
         room, left = planned.room, planned.left
@@ -314,13 +316,13 @@ class LocalPlanner:
 
     def _pass_time(self, request: PlanRequest) -> None:
         if self._tick is None:
-            self._began = request.tick
+            self._first_tick = request.tick
         elif request.tick > self._tick:
             self._sampler.shift((request.tick - self._tick) * TICK_S)
         self._tick = request.tick
 
     def _at_goal(self, request: PlanRequest) -> bool:
-        """Return whether the body is at its goal, and moves no farther; it may turn there still."""
+        """Return whether the body stands at its goal; it may still turn there."""
         goal, pose, v = request.goal, request.pose, request.velocity
         off = math.hypot(goal.x - pose.x, goal.y - pose.y)
         turn = 0.0 if goal.yaw is None else abs(math.remainder(goal.yaw - pose.yaw, math.tau))
@@ -339,10 +341,10 @@ class LocalPlanner:
         patience = self._settings.stuck_after
         if request.max_speed:
             patience = max(patience, SLOW_PATIENCE * STUCK_RADIUS_M / request.max_speed)
-        return self._waits_s(request) > patience
+        return self._time_in_place_s(request) > patience
 
-    def _waits_s(self, request: PlanRequest) -> float:
-        """Return for how long the body has been in one place [s]."""
+    def _time_in_place_s(self, request: PlanRequest) -> float:
+        """Return the time that the body has been in one place [s]."""
         here, then = request.pose, self._anchor
         gone = math.hypot(here.x - then.x, here.y - then.y) > STUCK_RADIUS_M
         if gone or not self._anchor_tick:
@@ -363,7 +365,7 @@ def _standing(reason: str, *, arrived: bool = False, blocked: bool = False) -> L
 
 def _trajectory(track: Floats, dt: float) -> tuple[TrajectoryPoint, ...]:
     """Return `track` (T + 1, 6) in the frame of its first pose."""
-    rows = track.tolist()  # plain numbers are quicker where they are few
+    rows = track.tolist()  # lists are faster than small arrays
     x, y, yaw, *_ = rows[0]
     cosine, sine = math.cos(yaw), math.sin(yaw)
     return tuple(
@@ -378,5 +380,5 @@ def _trajectory(track: Floats, dt: float) -> tuple[TrajectoryPoint, ...]:
     )
 
 
-def _axes(of: Velocity) -> tuple[float, float, float]:
+def _twist_tuple(of: Velocity) -> tuple[float, float, float]:
     return of.linear_x, of.linear_y, of.angular_z

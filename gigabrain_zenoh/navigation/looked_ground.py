@@ -1,12 +1,13 @@
-"""Ground that cameras have looked at: what stands low on other ground nobody knows.
+"""Ground that cameras have looked at; elsewhere, low obstacles may be unknown.
 
-A camera sees a wedge ahead. Beside the body, and nearer than it sees the floor, a sill or a step
-down may be that has never been in view. So ground that a body may sweep soon, and that was neither
-in view nor stood on, costs like an obstacle MARGIN_M away: the body turns more in place, and looks.
-It is not closed: a body that may turn nowhere would stand for ever. So would one that can go aside:
-it stands with the heading that it needs, and does not turn to look. For that one unknown ground is
-so far away that it need not brake. A body that gets no farther turns to look where its way leads,
-or backs off to see it; a narrow gap before it is filled.
+A camera sees a wedge ahead. Beside the body, or closer than the camera sees the floor, there may be
+a sill or a step down that was never in view. Such ground, unless the body has stood on it, costs
+like an obstacle MARGIN_M away. So the body turns more in place, and looks.
+
+Unseen ground is not forbidden: a body without room to turn would stand for ever. A body that can
+move sideways keeps its heading and does not turn to look. For it, unseen ground is as far away as
+its stopping distance, so that it need not brake. A stuck body turns to look where its way leads, or
+backs off to see the ground. Narrow gaps near it then count as seen.
 """
 
 import math
@@ -30,41 +31,41 @@ from gigabrain_zenoh.navigation.local_costmap import (
 )
 from gigabrain_zenoh.navigation.zones import fill
 
-RELIABLE_M = 1.5  # from a camera: so far it shows what is 3 cm high
-EDGE_RAD = math.radians(1.5)  # at the sides of a picture that is not trusted
-SOON_M = 0.25  # beyond the circle of a turning body, which it may sweep before it has looked
-PLACED_M = 0.1  # beyond that circle, clear where a person puts the body down
-MARGIN_M = 0.06  # as far as an obstacle whose cost unknown ground has
-GAP_M = 0.12  # narrower than this, between looked ground: what stands low shows beside it
-BIN_RAD = math.radians(3.0)  # of the bearings round a camera
-SHADE_STEP_M = 0.015  # between points of an outline that hides what is behind it
-BEHIND_M = 0.05  # of what is behind an outline's nearest point that is seen nevertheless
+RELIABLE_M = 1.5  # range within which a camera shows obstacles 3 cm high
+EDGE_RAD = math.radians(1.5)  # at the left and right of a picture, not trusted
+SOON_M = 0.25  # beyond the circle of a turning body, that it may reach before it has looked
+PLACED_M = 0.1  # beyond that circle, assumed to be clear at the start
+MARGIN_M = 0.06  # distance of the obstacle whose cost unseen ground has
+GAP_M = 0.12  # unseen gaps narrower than this hide no obstacle
+BIN_RAD = math.radians(3.0)  # of bearings round a camera
+SHADE_STEP_M = 0.015  # between points of an outline that is_unseen_ahead the ground behind it
+BEHIND_M = 0.05  # behind the nearest point of an outline, still seen
 Mask = NDArray[np.bool_]
 
 
 class LookedGround:
-    """Cells of a window that were in view of the cameras of `body`, or that it has stood on.
+    """Cells of a window that the cameras of `body` have seen, or that it has stood on.
 
-    The window has the cells of a LocalCostmap. It is empty, and hides nothing, until a camera has
-    been believed once.
+    The window has the cells of a LocalCostmap. Before the first look of a trusted camera, no ground
+    counts as unseen.
     """
 
     def __init__(self, body: BodyDescription, side: int) -> None:
         self._body, self._side = body, side
-        self._turning = radius(body.footprint)
+        self._turning_radius = radius(body.footprint)
         along, aside = brakes(body)["forward"], body.max_lateral_speed > 0.0
         self._margin = along.reach if aside else MARGIN_M
         self._looked = np.zeros((side, side), np.uint8)
-        self._row = self._column = 0  # of cell (0, 0)
+        self._row = self._column = 0  # of the window's first cell
         self._chamfer = Chamfer(side, CELL_M, MAX_DISTANCE_M)
-        self._began = False
+        self._has_looked = False
 
     def limited(
         self, grid: DistanceGrid, place: Pose2D, cameras: Sequence[str], outlines: Sequence[Floats]
     ) -> DistanceGrid:
-        """Return `grid` with obstacles beyond the ground near `place` that no camera has looked at.
+        """Look, and return `grid` with unseen ground near `place` as distant obstacles.
 
-        See `look`; the cells of `grid` are those of the window.
+        For the arguments see `look`. The cells of `grid` are those of the window.
         """
         self.look(place, cameras, outlines, grid.x, grid.y)
         unseen = self._unseen(place)
@@ -75,17 +76,18 @@ class LookedGround:
     def look(
         self, place: Pose2D, cameras: Sequence[str], outlines: Sequence[Floats], x: float, y: float
     ) -> None:
-        """Take in what the believed `cameras` see from `place`, in the window at (x, y) [m].
+        """Add the ground that the trusted `cameras` see from `place`.
 
-        The polygons `outlines` (n, 2) [m] hide what is behind them.
+        The corner of the window is at (x, y) [m]. Polygons `outlines` (n, 2) [m] hide the ground
+        behind them.
         """
         seeing = [one for one in self._body.cameras if one.name in cameras and one.depth]
-        if not seeing and not self._began:
+        if not seeing and not self._has_looked:
             return
-        self._follow(round(y / CELL_M), round(x / CELL_M))
-        if not self._began:
-            self._began = True
-            reach = math.ceil((self._turning + PLACED_M) / CELL_M)
+        self._move_window(round(y / CELL_M), round(x / CELL_M))
+        if not self._has_looked:
+            self._has_looked = True
+            reach = math.ceil((self._turning_radius + PLACED_M) / CELL_M)
             fill_disc(self._looked, *self._cell(place.x, place.y), reach)
         cos, sin = math.cos(place.yaw), math.sin(place.yaw)
         turn = np.array([[cos, sin], [-sin, cos]])
@@ -96,37 +98,38 @@ class LookedGround:
             self._see(camera, eye, place.yaw + camera.yaw, outlines)
 
     def fill_gaps(self, place: Pose2D) -> None:
-        """Count unseen ground near `place` that is narrower than GAP_M as looked at."""
-        if not self._began:
+        """Count unseen gaps near `place` that are narrower than GAP_M as seen."""
+        if not self._has_looked:
             return
         deep = self._chamfer.distance((self._looked == 0).view(np.uint8)) > GAP_M / 2
         beyond = self._chamfer.distance((~deep).view(np.uint8)) > GAP_M / 2
         self._looked[self._near(place) & beyond] = 1
 
-    def hides(self, place: Pose2D, bearing: float, half_width: float) -> bool:
-        """Return whether there is unseen ground near `place` on the way at a `bearing` [rad].
+    def is_unseen_ahead(self, place: Pose2D, bearing: float, half_width: float) -> bool:
+        """Return whether there is unseen ground near `place` in the direction `bearing` [rad].
 
-        The way is `half_width` [m] wide to both sides, and begins where a turning body ends.
+        The strip ahead is `half_width` [m] wide to both sides. It begins at the circle of the
+        turning body.
         """
-        if not self._began:
+        if not self._has_looked:
             return False
         rows, columns = np.nonzero(self._near(place) & (self._looked == 0))
         x = (columns + self._column + 0.5) * CELL_M - place.x
         y = (rows + self._row + 0.5) * CELL_M - place.y
         cos, sin = math.cos(bearing), math.sin(bearing)
         ahead, aside = cos * x + sin * y, cos * y - sin * x
-        return bool(np.any((ahead > self._turning) & (np.abs(aside) <= half_width)))
+        return bool(np.any((ahead > self._turning_radius) & (np.abs(aside) <= half_width)))
 
     def _near(self, place: Pose2D) -> Mask:
-        """Return the cells that a body at `place` may sweep soon."""
+        """Return the cells that a body at `place` may reach soon."""
         near = np.zeros((self._side, self._side), np.uint8)
-        reach = math.ceil((self._turning + SOON_M) / CELL_M)
+        reach = math.ceil((self._turning_radius + SOON_M) / CELL_M)
         fill_disc(near, *self._cell(place.x, place.y), reach)
         return near > 0
 
     def _unseen(self, place: Pose2D) -> Singles | None:
-        """Return distances (side, side) to unseen ground near `place`; None where all was seen."""
-        if not self._began:
+        """Return distances (side, side) to unseen ground near `place`; None without any."""
+        if not self._has_looked:
             return None
         unseen = self._near(place) & (self._looked == 0)
         if not unseen.any():
@@ -140,8 +143,8 @@ class LookedGround:
     def _cell(self, x: float, y: float) -> tuple[int, int]:
         return math.floor(y / CELL_M) - self._row, math.floor(x / CELL_M) - self._column
 
-    def _follow(self, row: int, column: int) -> None:
-        """Move the window; what leaves it is forgotten."""
+    def _move_window(self, row: int, column: int) -> None:
+        """Move the window, and forget cells outside."""
         down, right = row - self._row, column - self._column
         if down or right:
             old, self._looked = self._looked, np.zeros_like(self._looked)
@@ -165,13 +168,13 @@ class LookedGround:
         bearing, away = _polar(right, up, yaw)
         ahead = away * np.cos(bearing)
         seen = (np.abs(bearing) < half) & (ahead >= near) & (ahead <= far)
-        free = _shades(eye, yaw, outlines)
+        free = _outline_distances(eye, yaw, outlines)
         seen &= away <= free[_bin(bearing, len(free))] + BEHIND_M
         part[seen] = 1
 
 
 def floor_in_view(camera: Camera) -> tuple[float, float, float]:
-    """Return how near and how far ahead a camera surely sees the floor [m], and half its angle."""
+    """Return the nearest and farthest floor in view [m], and half the view angle [rad]."""
     fx, fy, _, cy = camera.pinhole
     lowest = camera.pitch + math.atan2(camera.height - cy, fy)
     highest = camera.pitch - math.atan2(cy, fy)
@@ -182,7 +185,7 @@ def floor_in_view(camera: Camera) -> tuple[float, float, float]:
 
 
 def _overlap(shift: int, side: int) -> tuple[slice, slice]:
-    """Return where the cells of a window stay that moves by `shift`: to, and from."""
+    """Return the new and the old slice of the cells that stay in a window moved by `shift`."""
     count = max(side - abs(shift), 0)
     to, from_ = max(-shift, 0), max(shift, 0)
     return slice(to, to + count), slice(from_, from_ + count)
@@ -197,7 +200,7 @@ def _bin(bearing: Floats, count: int) -> NDArray[np.intp]:
     return np.minimum(((bearing + math.pi) / BIN_RAD).astype(np.intp), count - 1)
 
 
-def _shades(eye: Floats, yaw: float, outlines: Sequence[Floats]) -> Floats:
+def _outline_distances(eye: Floats, yaw: float, outlines: Sequence[Floats]) -> Floats:
     """Return the distance of the nearest outline in each bin of bearings (n,) [m]."""
     free = np.full(round(math.tau / BIN_RAD), np.inf)
     if outlines:

@@ -21,7 +21,7 @@ DETOUR_M = 0.15  # distance from the straight line, beyond which the body goes r
 def classify_plan(model: MotionModel, track: Floats, dt: float, goal: Goal) -> PlanKind:
     """Return the kind of motion of `track` (T + 1, 6) within the next second."""
     soon = min(len(track) - 1, max(1, round(REPORTED_S / dt)))
-    begin, end = track[0].tolist(), track[soon].tolist()  # plain numbers are quicker
+    begin, end = track[0].tolist(), track[soon].tolist()  # lists are faster
     distance = math.hypot(end[0] - begin[0], end[1] - begin[1])
     turned = abs(end[2] - begin[2])
     if distance < STILL_SHARE * model.forward * soon * dt:

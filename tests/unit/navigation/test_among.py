@@ -71,7 +71,7 @@ def test_slow_bodies_and_those_among_what_is_slow_plan_as_ever(
     body: BodyDescription, speed: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     here = plans(body, speed)
-    monkeypatch.setattr(dynamic_obstacles, "moving_quickly", lambda discs: discs[:0])
+    monkeypatch.setattr(dynamic_obstacles, "quick_discs", lambda discs: discs[:0])
     assert plans(body, speed) == here
 
 
@@ -80,7 +80,7 @@ def test_a_quick_body_among_quick_things_looks_two_seconds_ahead(
 ) -> None:
     here = plans(JACKAL, 1.2)
     assert here[0].trajectory[-1].t == pytest.approx(2.0)
-    monkeypatch.setattr(dynamic_obstacles, "moving_quickly", lambda discs: discs[:0])
+    monkeypatch.setattr(dynamic_obstacles, "quick_discs", lambda discs: discs[:0])
     there = plans(JACKAL, 1.2)
     assert there[0].trajectory[-1].t == pytest.approx(1.5)
     assert there != here
@@ -144,10 +144,10 @@ def test_what_moves_takes_its_hits_along_and_a_wall_beside_it_stays() -> None:
     for tick in range(1, 40, 2):
         x = 1.5 - 0.02 * tick  # 1 m/s, towards the lidar
         front = wall((x - 0.3, -0.15), (x - 0.3, 0.15))
-        window.see(tick, here, (0.0, 0.0), np.concatenate([front, beside]))
+        window.add_scan(tick, here, (0.0, 0.0), np.concatenate([front, beside]))
         moving = np.array([(x, 0.0, -1.0, 0.0, 0.3, 0.0)])
         assert len(window.moving(tick, moving)) == 1
-        window.take_back(tick, moving)
+        window.clear_tracks(tick, moving)
     left = window.grid(39, NOTHING, NOBODY).distance
     assert left[80, 80 + 32] == pytest.approx(0.38, abs=0.04)
     assert left[80 + 15, 80 + 32] < 0.03

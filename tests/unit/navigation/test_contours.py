@@ -13,7 +13,7 @@ from gigabrain_schemas.brain import Contour
 from gigabrain_schemas.tasks import Goal
 from gigabrain_zenoh.geometry import polygon
 from gigabrain_zenoh.navigation.contours import KEPT_TICKS, ContourMemory, covered, placed
-from gigabrain_zenoh.navigation.dynamic_obstacles import standing
+from gigabrain_zenoh.navigation.dynamic_obstacles import static_polygons
 from gigabrain_zenoh.navigation.local_planner import LocalPlan, PlanRequest
 from gigabrain_zenoh.testing.samples import ARMED, WRIST
 from tests.unit.navigation.drives import WAFFLE, Drive, wall
@@ -96,8 +96,8 @@ def test_a_body_within_a_contour_can_leave_it() -> None:
 def test_the_contour_of_what_moves_is_left_to_its_disc() -> None:
     discs = np.array([[1.0, 0.0, 0.5, 0.0, 0.3, 0.0]])
     person, table = box(1.1, 0.1), box(2.0, 0.0)
-    assert standing((person, table), discs) == (table,)
-    assert standing((person, table), discs[:0]) == (person, table)
+    assert static_polygons((person, table), discs) == (table,)
+    assert static_polygons((person, table), discs[:0]) == (person, table)
 
 
 def test_polygons_are_placed_where_the_body_is() -> None:

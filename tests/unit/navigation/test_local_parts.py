@@ -117,7 +117,7 @@ def test_clearance_is_the_outlines_distance_to_the_nearest_obstacle() -> None:
     random = np.random.default_rng(3)
     points = random.uniform(-1.5, 1.5, (25, 2))
     points = points[np.hypot(points[:, 0], points[:, 1]) > 0.5]
-    window.see(1, Pose2D(0.0, 0.0, 0.0), (0.0, 0.0), points)
+    window.add_scan(1, Pose2D(0.0, 0.0, 0.0), (0.0, 0.0), points)
     grid, outline = window.grid(1, NOTHING, NOBODY), outline_of(WAFFLE.footprint)
     for x, y, yaw in random.uniform((-0.3, -0.3, -3.0), (0.3, 0.3, 3.0), (50, 3)).tolist():
         got = clearance(grid, outline, Placement(x, y, math.cos(yaw), math.sin(yaw)))
@@ -187,7 +187,7 @@ def test_what_is_inside_the_body_leaves_no_clearance() -> None:
 
 def test_the_way_straight_on_ends_at_a_wall() -> None:
     window = LocalCostmap(4.0, 10.0)
-    window.see(1, Pose2D(0.0, 0.0, 0.0), (0.0, 0.0), wall((0.9, -0.5), (0.9, 0.5)))
+    window.add_scan(1, Pose2D(0.0, 0.0, 0.0), (0.0, 0.0), wall((0.9, -0.5), (0.9, 0.5)))
     grid, outline = window.grid(1, NOTHING, NOBODY), outline_of(WAFFLE.footprint)
     free = free_ahead(grid, outline, Placement(0.0, 0.0, 1.0, 0.0), 1.0, 0.03, 2.0)
     assert free == pytest.approx(0.8, abs=0.05)
@@ -197,27 +197,27 @@ def test_the_way_straight_on_ends_at_a_wall() -> None:
 def test_what_has_moved_leaves_no_ghost() -> None:
     window, here = LocalCostmap(4.0, 10.0), Pose2D(0.0, 0.0, 0.0)
     behind = wall((1.5, -0.5), (1.5, 0.5))
-    window.see(1, here, (0.0, 0.0), np.array([(0.8, 0.0)]))
+    window.add_scan(1, here, (0.0, 0.0), np.array([(0.8, 0.0)]))
     assert window.grid(1, NOTHING, NOBODY).distance[80, 112] < 0.03
-    window.see(6, here, (0.0, 0.0), behind)
+    window.add_scan(6, here, (0.0, 0.0), behind)
     assert window.grid(6, NOTHING, NOBODY).distance[80, 112] < 0.03  # one beam may err
-    window.see(11, here, (0.0, 0.0), behind)
+    window.add_scan(11, here, (0.0, 0.0), behind)
     assert window.grid(11, NOTHING, NOBODY).distance[80, 112] == pytest.approx(0.7, abs=0.03)
 
 
 def test_what_no_beam_can_check_is_believed_for_its_time() -> None:
     window, here = LocalCostmap(4.0, 1.0), Pose2D(0.0, 0.0, 0.0)
-    window.see(1, here, (0.0, 0.0), np.array([(-0.8, 0.0)]))
-    window.see(50, here, (0.0, 0.0), np.array([(0.8, 0.0)]))
+    window.add_scan(1, here, (0.0, 0.0), np.array([(-0.8, 0.0)]))
+    window.add_scan(50, here, (0.0, 0.0), np.array([(0.8, 0.0)]))
     assert window.grid(50, NOTHING, NOBODY).distance[80, 48] < 0.03
-    window.see(52, here, (0.0, 0.0), np.array([(0.8, 0.0)]))
+    window.add_scan(52, here, (0.0, 0.0), np.array([(0.8, 0.0)]))
     assert window.grid(52, NOTHING, NOBODY).distance[80, 48] > 1.0
 
 
 def test_the_window_goes_with_the_robot_and_keeps_what_it_saw() -> None:
     window = LocalCostmap(4.0, 10.0)
-    window.see(1, Pose2D(0.0, 0.0, 0.0), (0.0, 0.0), np.array([(1.0, 0.5)]))
-    window.see(2, Pose2D(0.5, 0.0, math.pi / 2), (0.0, 0.0), np.array([(0.0, 1.2)]))
+    window.add_scan(1, Pose2D(0.0, 0.0, 0.0), (0.0, 0.0), np.array([(1.0, 0.5)]))
+    window.add_scan(2, Pose2D(0.5, 0.0, math.pi / 2), (0.0, 0.0), np.array([(0.0, 1.2)]))
     grid = window.grid(2, NOTHING, NOBODY)
     for x, y in ((1.0, 0.5), (-0.7, 0.0)):
         row, column = int((y - grid.y) / 0.025), int((x - grid.x) / 0.025)
@@ -227,12 +227,12 @@ def test_the_window_goes_with_the_robot_and_keeps_what_it_saw() -> None:
 @pytest.mark.parametrize(("x", "y"), [(3.5, 0.0), (0.0, -3.5), (-2.5, 2.0), (9.0, 0.0)])
 def test_what_leaves_the_window_is_forgotten(x: float, y: float) -> None:
     window, around = LocalCostmap(4.0, 10.0), np.random.default_rng(6).uniform(-1.9, 1.9, (200, 2))
-    window.see(1, Pose2D(0.0, 0.0, 0.0), (0.0, 0.0), around)
+    window.add_scan(1, Pose2D(0.0, 0.0, 0.0), (0.0, 0.0), around)
     there = _occupied(window.grid(1, NOTHING, NOBODY))
-    window.see(2, Pose2D(x, y, 0.0), (0.0, 0.0), NOTHING)
+    window.add_scan(2, Pose2D(x, y, 0.0), (0.0, 0.0), NOTHING)
     kept = {(a, b) for a, b in there if abs(a - 40 * x) <= 80 and abs(b - 40 * y) <= 80}
     assert _occupied(window.grid(2, NOTHING, NOBODY)) == kept
-    window.see(3, Pose2D(0.0, 0.0, 0.0), (0.0, 0.0), NOTHING)
+    window.add_scan(3, Pose2D(0.0, 0.0, 0.0), (0.0, 0.0), NOTHING)
     assert _occupied(window.grid(3, NOTHING, NOBODY)) == kept < there
 
 
@@ -247,7 +247,7 @@ def _occupied(grid: DistanceGrid) -> set[tuple[float, float]]:
 
 def test_known_points_of_the_map_count_and_are_not_remembered() -> None:
     window = LocalCostmap(4.0, 10.0)
-    window.see(1, Pose2D(0.0, 0.0, 0.0), (0.0, 0.0), NOTHING)
+    window.add_scan(1, Pose2D(0.0, 0.0, 0.0), (0.0, 0.0), NOTHING)
     known = np.array([(0.5, 0.0), (99.0, 0.0)])
     assert window.grid(1, known, NOBODY).distance[80, 100] < 0.03
     assert window.grid(1, NOTHING, NOBODY).distance[80, 100] == 3.0
@@ -257,15 +257,15 @@ def test_a_post_that_seems_to_move_is_believed_only_where_it_was_not_before() ->
     window, here = LocalCostmap(4.0, 10.0), Pose2D(0.0, 0.0, 0.0)
     claimed = np.array([(1.0, 0.0, 0.8, 0.0, 0.1, 0.1)])
     for tick in range(1, 32, 5):
-        window.see(tick, here, (0.0, 0.0), np.array([(0.95, 0.0)]))
+        window.add_scan(tick, here, (0.0, 0.0), np.array([(0.95, 0.0)]))
     assert len(window.moving(31, claimed)) == 0
-    window.see(36, here, (0.0, 0.0), np.array([(1.05, 0.05)]))
+    window.add_scan(36, here, (0.0, 0.0), np.array([(1.05, 0.05)]))
     assert len(window.moving(36, claimed)) == 1
 
 
 def test_the_way_to_the_goal_goes_round_a_wall() -> None:
     window = LocalCostmap(4.0, 10.0)
-    window.see(1, Pose2D(0.0, 0.0, 0.0), (0.0, 0.0), wall((0.8, -1.0), (0.8, 1.0)))
+    window.add_scan(1, Pose2D(0.0, 0.0, 0.0), (0.0, 0.0), wall((0.8, -1.0), (0.8, 1.0)))
     grid = window.grid(1, NOTHING, NOBODY)
     field = CostToGo(window.cells).field(grid, 0.155, (1.6, 0.0), None)
     middle = field.distance.shape[0] // 2
@@ -276,7 +276,7 @@ def test_the_way_to_the_goal_goes_round_a_wall() -> None:
 
 def test_a_path_is_followed_to_where_it_leaves_the_window() -> None:
     window = LocalCostmap(4.0, 10.0)
-    window.see(1, Pose2D(0.0, 0.0, 0.0), (0.0, 0.0), NOTHING)
+    window.add_scan(1, Pose2D(0.0, 0.0, 0.0), (0.0, 0.0), NOTHING)
     grid = window.grid(1, NOTHING, NOBODY)
     path = np.array([(0.0, 0.1 * i) for i in range(60)])
     field = CostToGo(window.cells).field(grid, 0.155, (5.0, 5.0), path)

@@ -230,7 +230,7 @@ def test_it_looks_for_a_few_seconds_and_only_at_what_was_not_seen() -> None:
 def test_a_body_larger_than_its_window_has_no_unseen_ground_beyond_it() -> None:
     ground = LookedGround(BODY, 8)  # 0.2 m to each side
     ground.look(HERE, ("front",), (), -4 * CELL_M, -4 * CELL_M)
-    assert not any(ground.hides(HERE, turn, 0.15) for turn in np.linspace(-3, 3, 7))
+    assert not any(ground.is_unseen_ahead(HERE, turn, 0.15) for turn in np.linspace(-3, 3, 7))
 
 
 def test_who_goes_aside_need_not_look() -> None:

@@ -39,21 +39,21 @@ def crossing(seconds: float, speed: float) -> TrafficMap:
     for tick in range(1, round(seconds * 50), 2):
         ys = [(speed * 0.02 * tick + k * 2.0) % 8.0 - 4.0 for k in range(4)]
         discs = np.array([(5.0, y, 0.0, speed, 0.5, 0.0) for y in ys])
-        traffic.see(tick, 0.0, 0.0, discs)
+        traffic.update(tick, 0.0, 0.0, discs)
     return traffic
 
 
 def test_where_nothing_quick_was_seen_ways_cost_what_they_are_long() -> None:
     traffic = TrafficMap(0.4, 2.0, 10.0)
-    traffic.see(1, 0.0, 0.0, NOBODY)
-    traffic.see(3, 0.0, 0.0, NOBODY)
+    traffic.update(1, 0.0, 0.0, NOBODY)
+    traffic.update(3, 0.0, 0.0, NOBODY)
     assert traffic.ways(GOAL) is None
 
 
 @pytest.mark.long
 def test_what_is_compiled_before_it_drives_is_all_that_it_will_call() -> None:
     warm_up_local_planner(ANY_BODY)
-    kernels: list[Any] = [dynamic_obstacles._add_watched, dynamic_obstacles._pass]
+    kernels: list[Any] = [dynamic_obstacles._add_watched, dynamic_obstacles._add_passing]
     kernels += [cost_to_go._scale_costs, cost_to_go._seed_rim]
     before = [kernel.overloads for kernel in kernels]
     drive_functions(crowd(), 0, HARD, 64)
@@ -85,7 +85,7 @@ def test_it_fades_and_is_forgotten() -> None:
     dearest = [price_of(traffic)]
     for minute in range(5):
         for tick in range(51 + 3000 * minute, 51 + 3000 * (minute + 1), UPDATE_TICKS):
-            traffic.see(tick, 0.0, 0.0, NOBODY)
+            traffic.update(tick, 0.0, 0.0, NOBODY)
             traffic.ways(GOAL)
         dearest.append(price_of(traffic))
     assert dearest[0] > 4.0
@@ -103,7 +103,7 @@ def test_it_stays_where_it_was_when_the_robot_goes_on(to: tuple[float, float]) -
     traffic = crossing(2.0, 1.7)
     before = traffic.ways(GOAL)
     for tick in range(101, 105 + UPDATE_TICKS, 2):
-        traffic.see(tick, *to, NOBODY)
+        traffic.update(tick, *to, NOBODY)
     after = traffic.ways(GOAL)
     assert before
     if to[0] > 100.0:
@@ -118,7 +118,7 @@ def test_it_stays_where_it_was_when_the_robot_goes_on(to: tuple[float, float]) -
 
 def test_the_local_field_leads_round_what_it_cannot_see_the_end_of() -> None:
     window = LocalCostmap(8.0, 10.0)
-    window.see(1, Pose2D(0.0, 0.0, 0.0), (0.0, 0.0), NOTHING)
+    window.add_scan(1, Pose2D(0.0, 0.0, 0.0), (0.0, 0.0), NOTHING)
     grid, costs = window.grid(1, NOTHING, NOBODY), CostToGo(window.cells)
     traffic = crossing(2.0, 1.7)
     plain = costs.field(grid, 0.2, GOAL, None)

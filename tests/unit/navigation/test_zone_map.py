@@ -186,7 +186,7 @@ def test_the_allowed_speed_falls_to_that_of_the_zone_before_the_body_is_there() 
 def test_a_body_in_a_zone_may_leave_it_and_come_no_farther_in() -> None:
     window = LocalCostmap(6.0, 10.0)
     nothing = np.empty((0, 2))
-    window.see(1, Pose2D(0.0, 0.0, 0.0), (0.0, 0.0), nothing)
+    window.add_scan(1, Pose2D(0.0, 0.0, 0.0), (0.0, 0.0), nothing)
     zone = np.array(((-1.0, -1.0), (4.0, -1.0), (4.0, 1.0), (-1.0, 1.0)))
     far = np.array(((2.0, 2.0), (2.5, 2.0), (2.5, 2.5), (2.0, 2.5)))
     body = np.array(((-0.9, 0.1), (-0.7, 0.1), (-0.7, -0.1), (-0.9, -0.1)))
