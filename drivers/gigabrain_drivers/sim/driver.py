@@ -1,4 +1,4 @@
-"""A body in MuJoCo: physics and sensors in a thread of their own, results posted to the loop."""
+"""A body in MuJoCo. Physics and sensors run in their own thread, which posts to the loop."""
 
 import asyncio
 import contextlib
@@ -36,13 +36,13 @@ log = logging.getLogger(__name__)
 
 T = TypeVar("T")
 STEPS_PER_TICK = TICK_NS // STEP_NS  # physics steps per tick of the robot's clock
-COMMAND_TIMEOUT_NS = 150_000_000  # of simulated time: as long as a firmware would wait
+COMMAND_TIMEOUT_NS = 150_000_000  # simulated time after which the body stops, like a firmware
 CHECKPOINT_TICKS = 5  # 100 ms
 SPEED_RANGE = (0.1, 100.0)
 
 
 def state_message(simulation: "Simulation", robot_type: str) -> RobotState:
-    """Return the body's state by its own sensors."""
+    """Return the body's state as measured by its sensors."""
     arm = simulation.arm
     odometry, charge, imu = simulation.odometry(), simulation.battery(), simulation.imu()
     return RobotState(
@@ -73,19 +73,19 @@ class Reading(NamedTuple):
     """The results of one step of 10 ms, passed from the physics thread to the loop."""
 
     imu: Imu
-    scan: LaserScan | None = None  # when the lidar has finished a turn, between two states
-    state: RobotState | None = None  # with the last step of a tick
-    news: Sequence[tuple[Topic[Any], Message]] = ()  # of the world, for viewers
-    checkpoint: Checkpoint | None = None  # to be written
+    scan: LaserScan | None = None  # after a turn of the lidar, between two states
+    state: RobotState | None = None  # at the last step of a tick
+    news: Sequence[tuple[Topic[Any], Message]] = ()  # messages on the world, for viewers
+    checkpoint: Checkpoint | None = None  # to be saved
 
 
 class MujocoDriver(Driver):
-    """Paced by the wall clock at speed 1; at others each tick waits until the last is answered."""
+    """Follows the wall clock at speed 1. At others, each tick waits for the brain's answer."""
 
     Options = MujocoOptions
 
     def __init__(self, robot: RobotFile, options: MujocoOptions, run: Run) -> None:
-        # it imports MuJoCo, which takes 0.2 s; to read its options is quick
+        # imported here, as MuJoCo takes 0.2 s and the class is also used to read options
         from gigabrain_drivers.sim.live_world import LiveWorld
 
         super().__init__(robot, options, run)
@@ -95,13 +95,13 @@ class MujocoDriver(Driver):
             )
         self.lockstep = run.speed != 1.0
         self._checkpoints = CheckpointFiles(Path(run.checkpoint)) if run.checkpoint else None
-        self._simulation = self._begin()
+        self._simulation = self._make_simulation()
         self._world = LiveWorld(self._simulation, run.world, robot.cameras)
         period_ns = 1e9 / robot.lidar.rate_hz if robot.lidar else math.inf
         self._scan_ticks = period_ns / TICK_NS
         self._next_scan = self._scan_ticks
-        self._ticks = 0  # since this driver began, like those of the robot's clock
-        self._last_ticks = self._ticks_left(run.seconds) if run.seconds else None
+        self._ticks = 0  # since the start of this driver, as in the robot's clock
+        self._last_ticks = self._remaining_ticks(run.seconds) if run.seconds else None
         self._commanded_ns = 0
         self._physics_s = 0.0  # CPU time of physics and lidar
         self._permits = threading.Semaphore(0)
@@ -109,22 +109,22 @@ class MujocoDriver(Driver):
         self._thread: threading.Thread | None = None
         self._bridge: Bridge | None = None
         self._readings: asyncio.Queue[Reading | Exception | None] = asyncio.Queue()
-        self._account = self._simulation.report(robot, run)  # as of the newest tick
+        self._report = self._simulation.report(robot, run)  # of the newest tick
         self._state: RobotState | None = None
         self.sensors = dict.fromkeys(("imu", "scan") if robot.lidar else ("imu",))
 
-    def _ticks_left(self, seconds: float) -> int:
-        """Return the ticks that are left of a run of `seconds`.
+    def _remaining_ticks(self, seconds: float) -> int:
+        """Return the ticks that remain of a run of `seconds`.
 
-        One that was resumed goes on a bit longer: others count from the last state that they got,
-        which may be older than the checkpoint.
+        A resumed run is longer by a checkpoint's period: others count from the newest state that
+        they received, which may be older than the checkpoint.
         """
-        done = self._simulation.time_ns
-        left = round((seconds * 1e9 - done) / TICK_NS)
-        return max(0, left) + CHECKPOINT_TICKS * (done > 0)
+        done_ns = self._simulation.time_ns
+        ticks = round((seconds * 1e9 - done_ns) / TICK_NS)
+        return max(0, ticks) + CHECKPOINT_TICKS * (done_ns > 0)
 
-    def _begin(self) -> "Simulation":
-        """Go on where an earlier driver of this run has died, or begin at the world's start."""
+    def _make_simulation(self) -> "Simulation":
+        """Resume at the checkpoint of an earlier driver of this run, or start the world."""
         from gigabrain_drivers.sim.physics import Simulation  # imports MuJoCo, as above
 
         body = sim_body(self.robot, self.options, self.run)
@@ -141,7 +141,7 @@ class MujocoDriver(Driver):
         return Simulation(body, world, seed)
 
     async def open(self) -> None:
-        """Take the first readings; time stands still until `ticks` is iterated."""
+        """Take the first readings. Time starts with the iteration of `ticks`."""
         self._state = self._read_state()
         self.sensors["imu"] = self._imu()
         if self.robot.lidar:
@@ -164,17 +164,17 @@ class MujocoDriver(Driver):
         self._simulation.command(0.0, 0.0)
 
     async def park(self) -> None:
-        """Stop: the physics ends with this process."""
+        """Stop. The physics ends with this process, so nothing can fall."""
         await self.stop()
 
     async def limp(self) -> None:
-        """Stop, see `park`; an arm's servos are switched off."""
+        """Stop, and switch off the servos of an arm."""
         await self.stop()
         if self._simulation.arm:
             self._simulation.arm.let_go()
 
     async def ticks(self, clock: Clock) -> AsyncIterator[int]:
-        """Yield one tick per 20 ms of simulated time, until the run's seconds are over."""
+        """Yield 1 every 20 ms of simulated time, until the end of the run."""
         self._bridge = Bridge()
         self._thread = threading.Thread(target=self._run_physics, name="physics", daemon=True)
         self._thread.start()
@@ -186,9 +186,9 @@ class MujocoDriver(Driver):
                 return
             if isinstance(reading, Exception):
                 if self._checkpoints:
-                    await self._checkpoints.discard()  # it would fall or diverge again
+                    await self._checkpoints.discard()  # it would fail again
                 raise reading
-            self._publish(reading)
+            self._publish_reading(reading)
             if self._checkpoints and reading.checkpoint:
                 saving = self._checkpoints.save(reading.checkpoint)
                 if self.lockstep:
@@ -200,16 +200,16 @@ class MujocoDriver(Driver):
     async def set_base_velocity(
         self, linear_x: float, linear_y: float, angular_z: float
     ) -> Velocity:
-        """Drive or walk; bodies on two wheels leave out what is sideways."""
+        """Drive or walk. Bodies on two wheels ignore the sideways part."""
         if self._state is None:
             raise BodyLost("the simulation is not open")
         self._commanded_ns = self._simulation.time_ns
         wanted = self.bounded(linear_x, linear_y, angular_z)
-        to = self._simulation.drive(wanted.linear_x, wanted.linear_y, wanted.angular_z)
-        return Velocity(linear_x=to.linear_x, linear_y=to.linear_y, angular_z=to.angular_z)
+        sent = self._simulation.drive(wanted.linear_x, wanted.linear_y, wanted.angular_z)
+        return Velocity(linear_x=sent.linear_x, linear_y=sent.linear_y, angular_z=sent.angular_z)
 
     async def set_joint_positions(self, positions: Mapping[str, float]) -> Mapping[str, float]:
-        """Have the arm's servos go to positions [rad] or [m]."""
+        """Send the arm's servos to positions [rad] or [m]; return them as sent."""
         if self._simulation.arm is None:
             return await super().set_joint_positions(positions)
         within = self.bounded_joints(positions)
@@ -217,7 +217,7 @@ class MujocoDriver(Driver):
         return within
 
     async def read_state(self) -> RobotState:
-        """The state at the end of the newest tick."""
+        """Return the state at the end of the newest tick."""
         if self._state is None:
             raise BodyLost("the simulation is not open")
         return self._state
@@ -229,10 +229,10 @@ class MujocoDriver(Driver):
         return await self._world.change(request)
 
     def report(self) -> Mapping[str, float | int | str | None]:
-        """The truth of the run so far."""
-        return self._account | {"physics_cpu_s": round(self._physics_s, 3)}
+        """Return the ground truth of the run so far."""
+        return self._report | {"physics_cpu_s": round(self._physics_s, 3)}
 
-    def _publish(self, reading: Reading) -> None:
+    def _publish_reading(self, reading: Reading) -> None:
         self._state = reading.state or self._state
         self.publish("imu", IMU, reading.imu)
         if reading.scan:
@@ -241,14 +241,14 @@ class MujocoDriver(Driver):
             self.emit(topic, message)
 
     def _run_physics(self) -> None:
-        """The physics thread. Whatever ends it is raised from `ticks`."""
+        """Run the physics thread. Its errors are raised by `ticks`."""
         try:
             self._simulate()
-        except Exception as error:  # noqa: BLE001 - handed on whole, to end the driver's process
+        except Exception as error:  # noqa: BLE001 - raised by `ticks`, to end the process
             self._post(error)
 
     def _simulate(self) -> None:
-        """Step until the run's seconds are over, or until closed."""
+        """Step until the end of the run, or until closed."""
         pace = Pace(STEP_S / self.run.speed)
         while not self._halt.is_set():
             if self.lockstep:
@@ -259,7 +259,7 @@ class MujocoDriver(Driver):
             self._ticks += 1
             scans = self._ticks >= self._next_scan
             for step in range(STEPS_PER_TICK):
-                # only a scan needs the thread between two states; waking it costs like a step
+                # between states, only a scan needs the thread; a wake-up costs as much as a step
                 pace.wait(1 if scans else STEPS_PER_TICK * (step == 0))
                 if self._halt.is_set():
                     return
@@ -273,18 +273,18 @@ class MujocoDriver(Driver):
             raise BodyLost(f"fell over after {self._simulation.time_ns / 1e9:.2f} s")
         news = self._world.step()
         if last:
-            self._account = self._simulation.report(self.robot, self.run)
+            self._report = self._simulation.report(self.robot, self.run)
             saves = self._checkpoints is not None and self._ticks % CHECKPOINT_TICKS == 0
             checkpoint = self._simulation.checkpoint() if saves else None
             return Reading(self._imu(), None, self._read_state(), news, checkpoint)
-        # a lidar is not synchronous with the states; between two of them the cores are idle
+        # like a real lidar, not synchronous with the states; between these, the cores are idle
         due = self._ticks >= self._next_scan
         if due:
             self._next_scan += self._scan_ticks
         return Reading(self._imu(), scan=self._scan() if due else None, news=news)
 
     def _timed(self, work: Callable[[], T]) -> T:
-        """Run a piece of physics and add its CPU time to the report."""
+        """Run `work`, and add its CPU time to the report."""
         began = time.thread_time()
         result = work()
         self._physics_s += time.thread_time() - began

@@ -1,4 +1,4 @@
-"""A body in a world, one step of 10 ms at a time. No bus, no clock and no thread of its own."""
+"""A body in a world, simulated in steps of 10 ms, without bus, clock or threads."""
 
 import hashlib
 from dataclasses import replace
@@ -39,10 +39,11 @@ from gigabrain_drivers.sim.world import Stream, World, generator
 from gigabrain_zenoh.errors import BodyLost, ConfigError, Unsupported
 
 GRAVITY = 9.81  # [m/s2]
-STALL_AMPERES, STALL_SHARE = 1.4, 4.0  # stall current of the default motor; factor on friction
-EDGE_OF_THE_WORLD_M = 1e3
+STALL_AMPERES = 1.4  # of the usual motor
+STALL_FRICTION_FACTOR = 4.0  # added stall torque, as a multiple of the gears' friction
+MAX_COORDINATE_M = 1e3  # of a robot that has not flown away
 PHYSICS = mujoco.mjtState.mjSTATE_FULLPHYSICS.value
-DIVERGED = (
+DIVERGENCE_WARNINGS = (
     mujoco.mjtWarning.mjWARN_BADQPOS,
     mujoco.mjtWarning.mjWARN_BADQVEL,
     mujoco.mjtWarning.mjWARN_BADQACC,
@@ -50,17 +51,17 @@ DIVERGED = (
 
 
 class Simulation:
-    """A body in a world. The same body, world, seed and calls give the same bits."""
+    """A body in a world. The same body, world, seed and calls give identical results."""
 
     def __init__(
         self, body: SimModel, world: World, seed: int, checkpoint: Checkpoint | None = None
     ) -> None:
-        """Begin at the world's start, or at rest at a checkpoint. Raises ConfigError."""
+        """Start at the world's start, or at rest at a checkpoint. Raises ConfigError."""
         self.model = compile_scene(body, world)
         self._digest = _digest(self.model)
         body = with_motors(body, self.model)
         self.data = mujoco.MjData(self.model)
-        self._divergences = [self.data.warning[kind] for kind in DIVERGED]  # counted by MuJoCo
+        self._warnings = [self.data.warning[kind] for kind in DIVERGENCE_WARNINGS]
         self._steps, self._substeps = 0, body.substeps
         self._locomotion = make_locomotion(body, self.model, self.data)
         self._base = self.model.body(f"{ROBOT}base").id
@@ -70,7 +71,7 @@ class Simulation:
             self.model.body(f"{PERSON}{number + 1 if number else ''}").id: Person(walk)
             for number, walk in enumerate(world.people)
         }
-        self._stood_before = 0  # stops of people who were removed
+        self._past_stops = 0  # stops of people before a checkpoint, or who were removed
         self._place_people()
         self.truth = Truth(self.model, self.data)
         self.things = Things(self.model, self.data, world, self.truth, self._set_walking)
@@ -113,7 +114,7 @@ class Simulation:
         )
 
     def _resume(self, checkpoint: Checkpoint, body: SimModel) -> None:
-        """Continue from a checkpoint at rest; odometry begins at zero. Raises ConfigError."""
+        """Continue at rest, with odometry from zero. Raises ConfigError."""
         if checkpoint.model != self._digest:
             raise ConfigError("the checkpoint is of another body or world")
         physics = np.frombuffer(checkpoint.physics)
@@ -127,7 +128,7 @@ class Simulation:
         self.things.restore(checkpoint.things)
         for person, walked in zip(self._people.values(), checkpoint.walked, strict=True):
             person.go_to(walked)
-        self._stood_before = checkpoint.person_stood
+        self._past_stops = checkpoint.person_stood
         self._place_people()
         mujoco.mj_forward(self.model, self.data)
         self.truth.restore(
@@ -139,32 +140,32 @@ class Simulation:
 
     @property
     def time_ns(self) -> int:
-        """Simulated time since the start."""
+        """Simulated time since the start [ns]."""
         return self._steps * STEP_NS
 
     def people(self) -> tuple[Person, ...]:
-        """Return the walking people."""
+        """Return the walking people of this world."""
         return tuple(self._people.values())
 
     @property
     def person_stood(self) -> int:
-        """The number of times that people stopped for the robot."""
-        return self._stood_before + sum(person.stood for person in self._people.values())
+        """The number of times that people had to stand for the robot."""
+        return self._past_stops + sum(person.stood for person in self._people.values())
 
     def command(self, linear_x: float, angular_z: float) -> tuple[float, float]:
-        """Drive without going sideways; returns (forward, turning), see `drive`."""
+        """Drive without sideways motion; return (forward, turning) as `drive` does."""
         twist = self.drive(linear_x, 0.0, angular_z)
         return twist.linear_x, twist.angular_z
 
     def drive(self, linear_x: float, linear_y: float, angular_z: float) -> Twist:
-        """Aim for a velocity [m/s, m/s, rad/s]; return the nearest possible one.
+        """Set the target velocity [m/s, m/s, rad/s]; return it within the body's abilities.
 
-        The body accelerates as fast as it can.
+        The body accelerates to it as fast as it can.
         """
         return self._locomotion.command(Twist(linear_x, linear_y, angular_z))
 
     def walk(self, gait: Gait) -> None:
-        """Aim for a gait. Raises Unsupported for a body without legs."""
+        """Set the target gait. Raises Unsupported for a body without legs."""
         self._locomotion.walk(gait)
 
     def advance(self) -> None:
@@ -193,7 +194,7 @@ class Simulation:
         self.truth.update()
 
     def scan(self) -> NDArray[np.float32]:
-        """Ranges (beams,) [m] from straight ahead counter-clockwise; inf: nothing in range.
+        """Return the ranges (beams,) [m], counter-clockwise from straight ahead; inf without a hit.
 
         Raises Unsupported when the body has no lidar.
         """
@@ -202,15 +203,15 @@ class Simulation:
         return self._lidar.scan(self.data)
 
     def odometry(self) -> OdometryReading:
-        """Pose and velocity by the body's own sensors."""
+        """Return pose and velocity as measured by the body's sensors."""
         return self._locomotion.odometry()
 
     def velocity(self) -> Twist:
-        """Return the velocity by the body's own sensors, sideways as well."""
+        """Return the velocity as measured by the body's sensors, including the sideways one."""
         return self._locomotion.velocity()
 
     def imu(self) -> ImuSample:
-        """The inertial unit's sample of this step."""
+        """Return the sample of the IMU in this step."""
         return self._sample
 
     def motors(self) -> tuple[Motor, ...]:
@@ -218,24 +219,24 @@ class Simulation:
         return (*self._locomotion.motors(), *(self.arm.motors() if self.arm else ()))
 
     def contacts(self) -> tuple[bool, ...]:
-        """Return which feet bear weight, by their own sensors; none on wheels."""
+        """Return for each foot whether it bears weight, by its sensor; empty on wheels."""
         return self._locomotion.contacts()
 
     @property
     def fallen(self) -> bool:
-        """True once the body lies on the floor, by its own attitude."""
+        """True once the body lies on the floor, by its attitude."""
         return self._locomotion.fallen
 
     def battery(self) -> Charge:
-        """Voltage, percentage 0-100 and current, positive when it drains."""
+        """Return voltage, percentage 0-100 and current, positive while discharging."""
         return self._battery.read()
 
     def bumper(self) -> bool:
-        """Return whether the robot, without its hand, touches anything but the floor."""
+        """Return whether the robot, except its hand, touches anything but the floor."""
         return self.truth.touching
 
     def report(self, robot: RobotFile, run: Run) -> dict[str, Any]:
-        """Return the truth of the run so far."""
+        """Return the ground truth of the run so far."""
         truth = self.truth
         pose = truth.pose()
         return {
@@ -255,11 +256,11 @@ class Simulation:
         }
 
     def _set_walking(self, body: int, person: Person | None) -> None:
-        """Make a spare body walk like `person`; None stops it."""
+        """Let a spare body walk as `person`; with None, stop it."""
         if person:
             self._people[body] = person
         elif body in self._people:
-            self._stood_before += self._people.pop(body).stood
+            self._past_stops += self._people.pop(body).stood
 
     def _place_people(self) -> None:
         for body, person in self._people.items():
@@ -268,30 +269,30 @@ class Simulation:
             self.data.mocap_quat[place] = yaw_quaternion(person.pose)
 
     def _check(self) -> None:
-        """Raise BodyLost if the simulation diverges: MuJoCo warns, or the robot flies away."""
+        """Raise BodyLost after a warning of MuJoCo, or if the robot has flown away."""
         x, y, z = self.data.xpos[self._base].tolist()
-        far = EDGE_OF_THE_WORLD_M
-        lost = any(warning.number for warning in self._divergences)
-        if lost or not (abs(x) < far and abs(y) < far and abs(z) < 1):
+        limit = MAX_COORDINATE_M
+        diverged = any(warning.number for warning in self._warnings)
+        if diverged or not (abs(x) < limit and abs(y) < limit and abs(z) < 1):
             raise BodyLost(f"the simulation diverged after {self.time_ns / 1e9:.2f} s")
 
 
 def _digest(model: mujoco.MjModel) -> bytes:
-    """Return the SHA-256 of a model, before it is changed."""
+    """Return the SHA-256 of a model. Call it before the model is changed."""
     data = np.empty(mujoco.mj_sizeModel(model), np.uint8)
     mujoco.mj_saveModel(model, None, data)
     return hashlib.sha256(data.tobytes()).digest()
 
 
 def with_motors(body: SimModel, model: mujoco.MjModel) -> SimModel:
-    """Return a body of a foreign model with motors sized for its weight and friction."""
+    """Return a body of a foreign model with motors for its weight and its gears' friction."""
     if not body.names or not isinstance(body, SimBody):
         return body
     mass = float(model.body_subtreemass[model.body(f"{ROBOT}base").id])
-    grip = mass * GRAVITY * body.wheel_radius  # [N m], of all wheels
+    grip = mass * GRAVITY * body.wheel_radius  # [N m], of all wheels together
     wheels = [int(model.joint(f"{ROBOT}{name}_joint").dofadr[0]) for name in body.rolling]
     friction = float(model.dof_frictionloss[wheels].max())
-    stall = grip + STALL_SHARE * friction
+    stall = grip + STALL_FRICTION_FACTOR * friction
     torque = max(stall / STALL_AMPERES, body.motor.torque_per_ampere)
     return replace(body, motor=msgspec.structs.replace(body.motor, torque_per_ampere=torque))
 
