@@ -199,7 +199,7 @@ class Mailbox(Generic[T]):
 
 MAX_WAITING = 32  # queries per key; beyond that the oldest are refused
 MAX_CONCURRENT = 32  # answers per key, unless it is urgent
-MAX_STARTS = 4  # of answers, per turn of the loop
+MAX_STARTS = 4  # new answers per turn of the loop
 
 
 class _QueriedKey(Generic[T]):

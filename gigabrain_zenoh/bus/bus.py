@@ -31,7 +31,7 @@ class Rejections:
 
     def __init__(self, clock: Clock) -> None:
         self._clock = clock
-        self.faults: dict[str, tuple[Fault, int]] = {}  # and time of the newest invalid message
+        self.faults: dict[str, tuple[Fault, int]] = {}  # fault, and time [ns] of its newest message
         self.counts: Counter[str] = Counter()
 
     def reject(self, key: str, error: ValueError) -> None:
@@ -61,7 +61,7 @@ Q = TypeVar("Q", bound=Message)
 R = TypeVar("R", bound=Message)
 CLOCK_LOST_NS = 3_000_000_000  # a process fails when all states for this long are refused
 STATE_GAP_NS = 1_000_000_000  # after a longer gap between states, that time starts again
-FETCH_TIMEOUT_S = 1.0  # for the answer of a process that keeps a value
+FETCH_TIMEOUT_S = 1.0  # processes that keep a value answer within this time
 FETCH_RETRY_NS, MAX_FETCH_RETRY_NS = 1_000_000_000, 8_000_000_000  # doubled each time
 
 
@@ -92,7 +92,7 @@ class Bus:
         self._refusing_since_ns = self._last_state_ns = 0
         self.closed = False
         self._kept: dict[str, bytes] = {}
-        self._fetching: set[asyncio.Task[None]] = set()
+        self._fetch_tasks: set[asyncio.Task[None]] = set()
 
     def publish(
         self,
@@ -254,7 +254,7 @@ class Bus:
     async def close(self) -> None:
         """Leave the network."""
         self.closed = True
-        for task in self._fetching:
+        for task in self._fetch_tasks:
             task.cancel()
         await self.transport.close()
 
@@ -338,12 +338,12 @@ class Bus:
                 retry_ns = min(2 * retry_ns, MAX_FETCH_RETRY_NS)
 
         def finished(task: "asyncio.Task[None]") -> None:
-            self._fetching.discard(task)
+            self._fetch_tasks.discard(task)
             if not task.cancelled() and isinstance(error := task.exception(), Exception):
                 self._fail(error)  # no code awaits this task
 
         task = asyncio.get_running_loop().create_task(fetch())
-        self._fetching.add(task)
+        self._fetch_tasks.add(task)
         task.add_done_callback(finished)
 
         def end() -> None:

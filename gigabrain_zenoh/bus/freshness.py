@@ -7,7 +7,7 @@ from gigabrain_schemas.topics import SCAN, STATE, Topic
 from gigabrain_zenoh.clock import Clock
 
 M = TypeVar("M", bound=Message)
-LEAD_TICKS = 5  # by which a process may lag behind the robot in reading its states
+LEAD_TICKS = 5  # a process may lag behind by this much in reading states
 CLOCK_KEYS = (STATE.key, SCAN.key)  # messages of the driver that move the robot's clock
 JUMP_TICKS = 50  # a larger jump, or another boot, has to be confirmed
 CONFIRMATIONS = 3  # messages in a row that have to agree

@@ -84,7 +84,7 @@ class Transport(Protocol):
 class _Watcher:
     key: str
     on_readers: OnReaders
-    has_readers: bool  # by the newest call of `on_readers`
+    has_readers: bool  # argument of the newest call of `on_readers`
 
 
 class LocalNetwork:

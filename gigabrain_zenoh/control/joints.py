@@ -27,7 +27,7 @@ from gigabrain_zenoh.geometry.joint_ramp import (
 )
 
 MAX_STEP_TICKS = 5  # longest step, also after a gap
-MAX_DEVIATION_TICKS = 3  # of motion at full speed, between our command and what the gate sent
+MAX_DEVIATION_TICKS = 3  # allowed between command and gate, in ticks of full-speed motion
 MAX_SPEED_FACTOR = 1.1  # the gate moves no joint faster than its maximum, except for rounding
 SLOW = 0.01  # [rad/s] or [m/s], a joint whose setpoint is slower counts as at rest
 Places = tuple[float, ...]

@@ -41,7 +41,7 @@ from gigabrain_zenoh.runtime.heartbeat import Progress
 log = logging.getLogger(__name__)
 
 MAX_RAMP_TICKS = 5  # longest step of the ramp, also after a gap
-STEADY_TICKS = 10  # of a constant setpoint, for the measured speed to reach it
+STEADY_TICKS = 10  # the measured speed reaches a constant setpoint within this time
 INTENT_TICKS = 2  # maximum age for joints: an arm rests within 120 ms of its last intent
 MIN_LEARN_LINEAR, MIN_LEARN_ANGULAR = 0.05, 0.1  # [m/s], [rad/s]; below, encoders are too coarse
 

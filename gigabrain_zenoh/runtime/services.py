@@ -57,7 +57,7 @@ def _rates(now: Counter[str], before: Counter[str], seconds: float) -> dict[str,
 
 
 TIMEOUT_S = 2.0  # without other processes there is no wait
-RETRY_NS = 100_000_000  # to query again a process that has to exit, or refused
+RETRY_NS = 100_000_000  # until the next query of a process that has to exit, or refused
 MAX_TRIES = 10  # after this many refusals a process is ignored
 CONFIRM_PAUSES_NS = (1_000_000_000, 3_000_000_000)  # pauses before each query after the first
 INSTANCE_BITS = 62

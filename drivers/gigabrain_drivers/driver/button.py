@@ -18,13 +18,13 @@ from gigabrain_zenoh.gate import causes as why
 
 log = logging.getLogger(__name__)
 
-ECHO_TIMEOUT_NS = 200_000_000  # a byte without an echo by then is lost
+ECHO_TIMEOUT_NS = 200_000_000  # later echoes are ignored
 PROBE_BYTES = 2  # random, so that an echo cannot be guessed or be an old one
 
 BAUD = 115_200
 PERIOD_NS = 20_000_000  # between two probes
 PUBLISH_EVERY = 2  # probes: 25 times a second
-STARTUP_NS = 1_000_000_000  # for the first echo; until then nothing is published
+STARTUP_NS = 1_000_000_000  # an open contact is not published before, as the port opens
 RECHECK_S = 0.1  # period of checking that the robot is latched
 
 

@@ -42,7 +42,8 @@ class Lockstep:
         self._period = period_ticks  # of control's commands
         self._tick = self._basis = self._newest = 0
         self._echoed = self._echo_basis = self._judged_basis = 0
-        self._safety_tick = self._required_tick = 0  # of the newest verdict; the oldest accepted
+        self._safety_tick = 0  # tick of the newest verdict
+        self._required_tick = 0  # oldest tick of a verdict that suffices
         self._exposed: dict[str, int] = {}  # tick of each camera's newest exposure
         self._pictures: dict[str, int] = {}  # tick of its newest picture
         self._contours: dict[str, int] = {}  # tick of its newest contours

@@ -62,8 +62,8 @@ log = logging.getLogger(__name__)
 ERROR_PATH = r" - at `[^`]*`$"  # the end that msgspec adds to an error
 BODY_EVERY_TICKS = 50  # once a second
 STATE_TOPICS = (SIM_SCENE, SIM_POSES)  # emitted before their tick, so that they wait for it
-CAMERAS_S = 30.0  # for the pictures of the first tick in lock-step
-MAX_HOLD_TICKS = 25  # 0.5 s, for limp joints to hold again
+CAMERAS_S = 30.0  # the first tick in lock-step waits this long for pictures
+MAX_HOLD_TICKS = 25  # 0.5 s; limp joints have to hold within this time
 # the echo's 150 ms plus the watchdog's 100 ms: no older command may move the body
 STALE_NS = 250_000_000
 

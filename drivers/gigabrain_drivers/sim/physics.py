@@ -39,9 +39,9 @@ from gigabrain_drivers.sim.world import Stream, World, generator
 from gigabrain_zenoh.errors import BodyLost, ConfigError, Unsupported
 
 GRAVITY = 9.81  # [m/s2]
-STALL_AMPERES = 1.4  # of the usual motor
+STALL_AMPERES = 1.4  # stall current of the usual motor
 STALL_FRICTION_FACTOR = 4.0  # added stall torque, as a multiple of the gears' friction
-MAX_COORDINATE_M = 1e3  # of a robot that has not flown away
+MAX_COORDINATE_M = 1e3  # farther away, the physics has diverged
 PHYSICS = mujoco.mjtState.mjSTATE_FULLPHYSICS.value
 DIVERGENCE_WARNINGS = (
     mujoco.mjtWarning.mjWARN_BADQPOS,

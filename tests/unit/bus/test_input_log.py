@@ -122,16 +122,16 @@ def test_a_replay_counts_the_oldest_work_where_it_is_logged_and_waits_for_it() -
     past.finish()
     assert counted == [1]
     past.finish()
-    past.finish()  # of work that nobody has begun
+    past.finish()  # no work has begun
     assert counted == [1, 2]
 
 
 def test_a_replay_takes_work_as_done_where_it_was_done_then() -> None:
     past = ReplayedInputLogger()
     past.outcomes.extend((False, True))
-    assert not past.in_time(finished(), 0.0)  # it was not, then
+    assert not past.in_time(finished(), 0.0)  # as recorded
     assert past.in_time(finished(), 0.0)
-    assert past.in_time(finished(), 0.0)  # nobody waited for it then
+    assert past.in_time(finished(), 0.0)  # no outcome is recorded
 
 
 def state(seq: int) -> bytes:
@@ -189,7 +189,7 @@ def test_a_recording_is_put_into_the_order_of_the_process_without_what_it_passed
         (2 * MS, WAITED),
     ]
     assert own.events[1][2] == state(3)
-    assert own.lost == 1  # a body that nobody has recorded
+    assert own.lost == 1  # a body that is not recorded
     assert own.start_ns == AT + 45 * MS
     assert own.end_ns == AT + 49 * MS
     assert logged_inputs(samples, "perception") is None

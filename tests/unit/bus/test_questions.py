@@ -83,7 +83,7 @@ async def test_no_more_than_4_queries_are_begun_in_a_turn_of_the_loop(rig: Rig) 
     await until(lambda: len(rig.begun) == 40)
     turns = list(rig.at_turn.values())
     assert max(turns.count(turn) for turn in turns) == 4
-    assert rig.begun[:4] == ["describe 0", "goal 0", "describe 1", "goal 1"]  # by turns
+    assert rig.begun[:4] == ["describe 0", "goal 0", "describe 1", "goal 1"]  # alternately
 
 
 async def test_a_flood_from_threads_loses_no_estop_and_tells_each_asker_once(rig: Rig) -> None:

@@ -17,7 +17,7 @@ OWN = ArmModel(mjcf="its own")
     ("other", "again"),
     [
         (ArmModel(mjcf="<"), 1),
-        (ArmModel(mjcf="its own", boot=9), 1),  # receivers ignore a model of another start
+        (ArmModel(mjcf="its own", boot=9), 1),  # receivers ignore a model of another boot
         (ArmModel(mjcf="its own", tick=9), 0),
     ],
 )

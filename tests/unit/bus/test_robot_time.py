@@ -114,7 +114,7 @@ def say(net: Net, message: RobotState) -> None:
 async def test_who_refuses_every_state_for_three_seconds_says_so_and_ends() -> None:
     net = Net()
     states = net.one.latest(STATE)
-    say(net, state(FAR))  # of the very first nothing better is known
+    say(net, state(FAR))  # the first message is accepted
     for tick in range(1, 149):
         say(net, state(tick))
         await net.clock.advance(20_000_000)

@@ -69,7 +69,7 @@ class ArmBench:
         self.here = [-sag] * len(self.sent)
         self.places: list[tuple[float, ...]] = []  # commanded
         self.missing = False
-        self.band = ANY_SPEED  # safety's
+        self.band = ANY_SPEED  # limits of safety
 
     def go(
         self, intent: Intent | None = None, *, teleop: JointSpeeds | None = None, ticks: int = 1

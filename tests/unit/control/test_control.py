@@ -105,7 +105,7 @@ def test_an_operator_comes_before_decision() -> None:
     drive.speeds(20, want(0.1))
     backwards = [drive.go(want(0.1), teleop=Velocity(linear_x=-0.04)).linear_x for _ in range(8)]
     assert backwards == pytest.approx([0.08, 0.06, 0.04, 0.02, 0.0, -0.02, -0.04, -0.04])
-    assert drive.memory.basis == drive.tick  # it rests on the operator's eyes
+    assert drive.memory.basis == drive.tick  # based on what the operator sees
 
 
 def test_when_an_operator_lets_go_it_holds_still_until_somebody_enables_it_again() -> None:
@@ -122,7 +122,7 @@ def test_an_operator_is_not_heard_while_the_gate_is_shut() -> None:
     drive = Drive()
     command = drive.go(want(0.2), teleop=Velocity(linear_x=0.2), gate=SHUT["idle"])
     assert command.linear_x == 0.0
-    assert drive.speeds(2, want(0.2)) == pytest.approx([0.0, 0.02])  # nor does it hold afterwards
+    assert drive.speeds(2, want(0.2)) == pytest.approx([0.0, 0.02])  # the operator does not drive
 
 
 def test_caps_of_safety_bound_each_direction() -> None:

@@ -106,7 +106,7 @@ def test_short_silences_of_decision_add_nothing_to_what_an_arm_presses_with() ->
     arm = enabled(sag=0.03)
     arm.go(targets(pan=0.5), ticks=200)
     arm.blocked = True
-    arm.here[0] = 0.4  # something pushes it away
+    arm.here[0] = 0.4  # an external force pushes it away
     for _ in range(10):
         arm.go(None, ticks=2)
         arm.go(targets(lift=0.5), ticks=10)
@@ -130,7 +130,7 @@ def test_a_joint_that_the_gate_slows_down_moves_no_other() -> None:
         before = arm.sent[1]
         arm.go(targets(lift=1.4))
         arm.sent[1] = replace(before, position=before.position + 0.002, velocity=0.1)
-        arm.here[0] = 0.47  # it is pushed away as well
+        arm.here[0] = 0.47  # an external force pushes it away
     assert {round(place[0], 2) for place in arm.places[-60:]} <= {
         round(there + off, 2) for off in (0.0, 0.01, 0.02)
     }

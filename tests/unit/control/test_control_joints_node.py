@@ -14,7 +14,7 @@ from gigabrain_zenoh.testing.in_memory import NodeBench
 from gigabrain_zenoh.testing.samples import BOOT
 from tests.unit.control.arm import ArmBench, arm_body, targets
 
-STEPS = 4  # in which a tick passes
+STEPS = 4  # per tick
 
 
 async def sent_while_moving(

@@ -54,7 +54,7 @@ def test_nothing_winds_up_while_a_cap_holds_the_body_back() -> None:
     drive.speeds(300, want(0.2))
     learnt = drive.memory.gain_x
     assert learnt == pytest.approx(1 / 0.9, abs=0.01)
-    for _ in range(500):  # the gate takes what the cap leaves
+    for _ in range(500):  # the gate clamps to the cap
         told = drive.go(want(0.2), caps=SpeedCaps(forward=0.1))
         drive._told = replace(told, linear_x=min(told.linear_x, 0.1))
     assert drive.v == pytest.approx(0.09, abs=0.001)
@@ -113,7 +113,7 @@ def test_no_wish_makes_a_command_that_jumps_or_goes_beyond_the_limits(
             dw = now.setpoint.angular_z - before.setpoint.angular_z
             assert abs(dv) <= 1.0 * 0.02 * passed + 1e-9
             assert abs(dw) <= 3.0 * 0.02 * passed + 1e-9
-        if not (opened and open_before):  # shut, or just opened
+        if not (opened and open_before):  # closed, or just opened
             assert (command.linear_x, command.angular_z) == (0.0, 0.0)
         assert abs(command.linear_x) <= 0.26
         assert abs(command.angular_z) <= 1.82

@@ -158,7 +158,7 @@ def test_caps_hold_from_the_tick_after_their_verdict_for_150_ms() -> None:
     assert caps_at(verdicts, state(2, boot=8)).forward == 0.05
 
 
-FORWARD = Twist(linear_x=0.1)  # what a person types: no boot, no tick
+FORWARD = Twist(linear_x=0.1)  # as typed by a person: no boot, no tick
 
 
 async def test_teleop_is_deaf_for_half_a_second_and_then_drives() -> None:
@@ -188,7 +188,7 @@ class Stick:
     def __init__(self) -> None:
         self.now_ms = 1000
         self.teleop = Teleop(lambda: self.now_ms * MS)
-        self.teleop.velocity(state(0), echo_wanted=False)  # the body was handed over long ago
+        self.teleop.velocity(state(0), echo_wanted=False)  # the hand-over was long ago
 
     def push(self, every_ms: int, times: int, twist: Twist = FORWARD) -> None:
         for _ in range(times):
@@ -223,7 +223,7 @@ def test_after_a_gap_of_more_than_200_ms_it_is_deaf_again(gap_ms: int, believed:
     stick.push(50, 11)
     stick.push(gap_ms, 1)
     assert stick.moves() is believed
-    stick.push(0, 100)  # all that the network had stored, at once
+    stick.push(0, 100)  # the network delivers all stored messages at once
     assert stick.moves() is believed
     stick.push(50, 10)
     assert stick.moves()
@@ -243,7 +243,7 @@ def test_a_stream_ends_200_ms_after_its_last_message(age_ms: int, moves: bool) -
         (100, BOOT, True, True),
         (90, BOOT, True, True),  # 200 ms ago
         (89, BOOT, False, False),
-        (110, BOOT, True, True),  # the operator may have seen a tick that is still on its way here
+        (110, BOOT, True, True),  # the operator's tick may arrive before ours
         (111, BOOT, False, False),
         (100, 8, False, False),
         (0, 0, False, True),  # no echo at all
@@ -283,7 +283,7 @@ def test_of_two_operators_the_first_one_steers_until_it_rests_or_is_silent() -> 
     stick, back = Stick(), Twist(linear_x=-0.2)
     stick.push(10, 1, by("page-1"))
     stick.push(10, 1, by("page-2", back))
-    stick.push(10, 1, by("teleop", REST))  # a station that nobody touches
+    stick.push(10, 1, by("teleop", REST))  # an idle station
     assert speed_of(stick) == 0.1
     stick.push(10, 1, by("page-1", REST))
     assert speed_of(stick) == -0.2
@@ -344,7 +344,7 @@ async def test_a_body_that_wants_25_commands_a_second_gets_every_second_tick() -
             chain.send(STATE, state(tick))
         assert [c.tick for c in chain.sent(CMD_VEL)] == [2, 4, 6, 8]
         chain.send(STATE, state(9))
-        chain.send(INTENT, intent(9))  # decision has thought again: that does not wait
+        chain.send(INTENT, intent(9))  # a new intent is not delayed
         assert [(c.tick, c.basis) for c in chain.sent(CMD_VEL)] == [(9, 9)]
 
 

@@ -50,7 +50,7 @@ def test_a_late_trajectory_begins_where_the_body_was_when_it_was_thought_of(
     body: BodyDescription, path: Path, late: int
 ) -> None:
     found = errors(Course(path, 9.0), Plant(body), 6.0, late=late)
-    assert max(found[100:]) < 0.015  # the first of them comes when the course has begun
+    assert max(found[100:]) < 0.015  # the first intent arrives after the start of the course
 
 
 def test_turning_on_the_spot_it_keeps_to_the_heading() -> None:

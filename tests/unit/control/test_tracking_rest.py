@@ -82,7 +82,7 @@ async def test_the_process_brakes_and_says_so_once_when_it_is_too_far_off(
             x += 0.02 * (speeds[-1] if speeds else 0.0) + (0.5 if tick in (51, 81) else 0.0)
             now = state(tick, v=speeds[-1] if speeds else 0.0, pose=(x, 0.0, 0.0))
             bench.send(STATE, now)
-            basis = max(1, 10 * ((tick - 1) // 10))  # of the jump decision does not know yet
+            basis = max(1, 10 * ((tick - 1) // 10))  # decision does not know of the jump yet
             bench.send(INTENT, replace(course.intent(basis, ActuationModel()), tick=tick))
             speeds += [command.linear_x for command in bench.sent(CMD_VEL)][-1:]
     assert [record.message for record in caplog.records] == [

@@ -64,7 +64,7 @@ def test_without_auto_resume_nothing_but_a_person_opens_it() -> None:
     rig.live(200, 0.2)
     assert (rig.mode, rig.state.output) == ("idle", ZERO)
     assert rig.feed(gate.Enable("control")) == gate.Outcome(text="control drives")
-    rig.live(4, 0.2)  # for 100 ms it stands, however much somebody wants
+    rig.live(4, 0.2)  # it stands for 100 ms after an enable
     assert (rig.mode, rig.state.output) == ("enabled", ZERO)
     rig.live(1, 0.2)
     assert (rig.mode, rig.state.output) == ("enabled", Velocity(linear_x=0.02))

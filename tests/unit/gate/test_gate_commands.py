@@ -147,7 +147,7 @@ def test_an_echo_of_seven_ticks_passes_and_one_of_eight_does_not() -> None:
 def test_the_hosts_clock_bounds_an_echo_as_well() -> None:
     rig = enabled()
     for tick in range(3):
-        rig.tick(wall_ns=1000 * MS + tick * 40 * MS)  # a body at half its speed
+        rig.tick(wall_ns=1000 * MS + tick * 40 * MS)  # a simulation at half speed
         rig.safety()
         rig.send()
     assert rig.send(0.1, echo=0, wall_ns=1230 * MS) == GOOD
@@ -176,7 +176,7 @@ def test_age_is_by_ticks_and_by_the_clock_whichever_is_more() -> None:
     assert gate.age_ns(rig.state, 20, 571 * MS) == 1 * MS
     assert gate.age_ns(rig.state, 18, 571 * MS) == 61 * MS
     assert gate.age_ns(rig.state, 18, 520 * MS) == 40 * MS
-    assert gate.age_ns(rig.state, 5, 571 * MS) == 451 * MS  # the oldest that is remembered
+    assert gate.age_ns(rig.state, 5, 571 * MS) == 451 * MS  # the oldest remembered tick
     assert gate.age_ns(rig.state, 4, 571 * MS) == 320 * MS
     assert gate.age_ns(rig.state, 21, 571 * MS) == -20 * MS
 
@@ -244,7 +244,7 @@ def test_the_brain_is_heard_whoever_drives_so_that_it_can_take_over() -> None:
     assert rig.feed(gate.Enable("control", take=True, by="alice")).ok
     rig.tick()
     rig.safety()
-    assert rig.state.output == ZERO  # it is heard, not obeyed
+    assert rig.state.output == ZERO  # its earlier commands do not count
     assert rig.send(0.1) == GOOD
 
 

@@ -150,7 +150,7 @@ def test_the_brain_takes_the_body_from_nobody_unless_a_person_hands_it_over() ->
 
 def test_a_held_joystick_moves_nothing_in_the_first_100_ms() -> None:
     rig = idle()
-    for _ in range(30):  # somebody holds it while the gate is shut
+    for _ in range(30):  # commands arrive while the gate is closed
         rig.tick()
         rig.safety()
         rig.send(0.26, source="alice")

@@ -31,7 +31,7 @@ class ArmRig(Rig):
         self.measured, self.limp = START, False
 
         self.caps: tuple[JointCap, ...] = ()
-        self.silent = False  # safety
+        self.silent = False  # True: safety is silent
 
     def arm_tick(self, count: int = 1) -> None:
         for _ in range(count):
@@ -135,7 +135,7 @@ def test_a_stream_that_ends_brakes_the_joints_within_40_ms_and_holds_them() -> N
 def test_a_body_that_is_reached_again_moves_no_joint_from_where_it_held_it(known: bool) -> None:
     rig = enabled()
     rig.follow(20, velocity=(1.0,))
-    places = (0.5, 0.06)  # after its own brakes, or after somebody has moved it
+    places = (0.5, 0.06)  # after the body braked, or was moved by hand
     lost = gate.Tick(
         ZERO, joints=rig.measured, faults=(causes.LINK_LOST,), held=places if known else ()
     )
@@ -151,7 +151,7 @@ def test_a_speed_of_zero_brakes_a_joint_that_was_sent_ahead() -> None:
     rig = enabled()
     lift = replace(JOINTS[0], gains=JointGains(feed_forward=0.08))
     rig.config = replace(rig.config, joints=(lift, JOINTS[1]))
-    rig.follow(30, velocity=(1.0,))  # until its servo lags behind by 0.08 s
+    rig.follow(30, velocity=(1.0,))  # its servo lags by 0.08 s
     at = rig.positions[0]
     rig.follow(5, velocity=(0.0,))
     assert rig.state.joints[0].velocity == pytest.approx(0.0)

@@ -124,7 +124,7 @@ def test_every_estop_counts() -> None:
 
 def test_nothing_jumps_when_it_is_enabled_within_the_tick_of_an_estop() -> None:
     rig = driving()
-    rig.live(30, 0.2)  # wheels that are stuck: the body is at rest while it is told to go
+    rig.live(30, 0.2)  # stuck wheels: the body is at rest despite its command
     rig.feed(gate.Estop("alice"))
     rig.feed(gate.Release(1))
     rig.feed(gate.Enable("control"))

@@ -89,7 +89,7 @@ def test_the_commander_is_judged_by_its_own_commands() -> None:
     rig = enabled("alice")
     for _ in range(6):
         quiet(rig)
-        rig.send()  # the brain
+        rig.send()  # as the brain
     assert (rig.mode, rig.codes) == ("stopping", ["silence"])
 
 
@@ -147,7 +147,7 @@ def test_a_verdict_that_was_overtaken_is_not_heard() -> None:
     before = rig.state
     rig.safety(BLIND, tick=1)
     assert rig.state == before
-    rig.safety(ZONE)  # of the same tick, and newer
+    rig.safety(ZONE)  # a newer one of the same tick
     assert rig.state.safety
     assert rig.state.safety.causes == (ZONE,)
 
@@ -231,7 +231,7 @@ def test_ticks_that_are_made_up_for_do_not_speed_the_body_up() -> None:
     assert rig.state.output == Velocity(linear_x=0.1)
     rig.safety()
     rig.send(0.2)
-    assert rig.state.output == Velocity(linear_x=0.1)  # this tick is a late one still
+    assert rig.state.output == Velocity(linear_x=0.1)  # this tick is still a late one
     rig.tick()
     assert rig.state.output.linear_x == pytest.approx(0.12)
 
