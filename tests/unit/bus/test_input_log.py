@@ -25,17 +25,19 @@ MS = 1_000_000
 AT = 1_700_000_000_000_000_000  # Unix time [ns]
 
 
-class Said:
-    """A journal whose time the test moves, and what it has said."""
+class RecordedLog:
+    """An input logger with a clock that the test moves, and its published messages."""
 
     def __init__(self) -> None:
-        self.words: list[InputLog] = []
+        self.messages: list[InputLog] = []
         self.now_ns = AT
-        self.input_log = PublishedInputLogger(self.words.append, lambda: self.now_ns)
+        self.input_log = PublishedInputLogger(self.messages.append, lambda: self.now_ns)
 
     def entries(self) -> list[tuple[str, int, int]]:
         return [
-            (word.keys[one.key], one.seq, one.after_us) for word in self.words for one in word.taken
+            (message.keys[entry.key], entry.seq, entry.after_us)
+            for message in self.messages
+            for entry in message.taken
         ]
 
 
@@ -46,14 +48,14 @@ def finished() -> Job:
 
 
 def test_what_was_looked_at_is_said_in_order_with_its_time() -> None:
-    said = Said()
-    said.input_log.note("robot/state", 7)
-    said.now_ns += 3 * MS
-    said.input_log.note("robot/scan", 2)
-    said.input_log.note("robot/state", 9)
-    said.input_log.flush()
-    assert said.words[0].began_ns == AT
-    assert said.entries() == [
+    recorded = RecordedLog()
+    recorded.input_log.note("robot/state", 7)
+    recorded.now_ns += 3 * MS
+    recorded.input_log.note("robot/scan", 2)
+    recorded.input_log.note("robot/state", 9)
+    recorded.input_log.flush()
+    assert recorded.messages[0].began_ns == AT
+    assert recorded.entries() == [
         ("robot/state", 7, 0),
         ("robot/scan", 2, 3000),
         ("robot/state", 9, 3000),
@@ -63,54 +65,54 @@ def test_what_was_looked_at_is_said_in_order_with_its_time() -> None:
 def test_a_message_that_two_parts_of_a_node_look_at_is_one_but_those_without_number_are_many() -> (
     None
 ):
-    said = Said()
+    recorded = RecordedLog()
     for seq in (4, 4, 5, 0, 0):
-        said.input_log.note("robot/body", seq)
-    said.input_log.flush()
-    assert [seq for _, seq, _ in said.entries()] == [4, 5, 0, 0]
+        recorded.input_log.note("robot/body", seq)
+    recorded.input_log.flush()
+    assert [seq for _, seq, _ in recorded.entries()] == [4, 5, 0, 0]
 
 
 def test_it_is_said_after_half_a_second_or_2048_entries_and_when_the_clock_goes_back() -> None:
-    said = Said()
-    said.input_log.note("robot/state", 1)
-    said.now_ns += 499 * MS
-    said.input_log.note("robot/state", 2)
-    assert not said.words
-    said.now_ns += 1 * MS
-    said.input_log.note("robot/state", 3)
-    assert [len(word.taken) for word in said.words] == [2]
-    said.now_ns -= 1 * MS
-    said.input_log.note("robot/state", 4)
-    assert [len(word.taken) for word in said.words] == [2, 1]
+    recorded = RecordedLog()
+    recorded.input_log.note("robot/state", 1)
+    recorded.now_ns += 499 * MS
+    recorded.input_log.note("robot/state", 2)
+    assert not recorded.messages
+    recorded.now_ns += 1 * MS
+    recorded.input_log.note("robot/state", 3)
+    assert [len(message.taken) for message in recorded.messages] == [2]
+    recorded.now_ns -= 1 * MS
+    recorded.input_log.note("robot/state", 4)
+    assert [len(message.taken) for message in recorded.messages] == [2, 1]
     for seq in range(5, 2060):
-        said.input_log.note("robot/state", seq)
-    assert [len(word.taken) for word in said.words] == [2, 1, 2048]
+        recorded.input_log.note("robot/state", seq)
+    assert [len(message.taken) for message in recorded.messages] == [2, 1, 2048]
 
 
 def test_nothing_is_said_of_nothing() -> None:
-    said = Said()
-    said.input_log.flush()
-    assert not said.words
+    recorded = RecordedLog()
+    recorded.input_log.flush()
+    assert not recorded.messages
 
 
 def test_whether_work_beside_was_in_time_is_said_as_well() -> None:
-    said = Said()
-    assert not said.input_log.in_time(Future(), 0.0)
-    assert said.input_log.in_time(finished(), 0.0)
-    said.input_log.flush()
-    assert [(key, seq) for key, seq, _ in said.entries()] == [(WAITED, 0), (WAITED, 1)]
+    recorded = RecordedLog()
+    assert not recorded.input_log.in_time(Future(), 0.0)
+    assert recorded.input_log.in_time(finished(), 0.0)
+    recorded.input_log.flush()
+    assert [(key, seq) for key, seq, _ in recorded.entries()] == [(WAITED, 0), (WAITED, 1)]
 
 
 async def test_work_that_counts_when_it_is_done_is_said_before_it_counts() -> None:
-    said, counted = Said(), asyncio.Event()
+    recorded, counted = RecordedLog(), asyncio.Event()
     work: Job = Future()
-    said.input_log.when_done(work, lambda job: (job.result(), counted.set()))
-    said.input_log.note("robot/state", 7)
+    recorded.input_log.when_done(work, lambda job: (job.result(), counted.set()))
+    recorded.input_log.note("robot/state", 7)
     threading.Thread(target=work.set_result, args=(None,)).start()
     await counted.wait()
-    said.input_log.note("robot/state", 8)
-    said.input_log.flush()
-    entries = [(key, seq) for key, seq, _ in said.entries()]
+    recorded.input_log.note("robot/state", 8)
+    recorded.input_log.flush()
+    entries = [(key, seq) for key, seq, _ in recorded.entries()]
     assert entries == [("robot/state", 7), (FINISHED, 1), ("robot/state", 8)]
 
 
@@ -144,32 +146,32 @@ def sample(at_ms: int, key: str, payload: bytes) -> Sample:
 
 def test_a_bus_with_a_journal_notes_what_is_valid() -> None:
     async def listen() -> list[tuple[str, int, int]]:
-        said, network = Said(), LocalNetwork()
+        recorded, network = RecordedLog(), LocalNetwork()
         bus = Bus(network.transport(), FakeClock())
-        bus.input_log = said.input_log
+        bus.input_log = recorded.input_log
         bus.latest(STATE)
         network.deliver(STATE.key, state(3))
         network.deliver(STATE.key, b"no message")
-        said.input_log.flush()
+        recorded.input_log.flush()
         await bus.close()
-        return said.entries()
+        return recorded.entries()
 
     assert asyncio.run(listen()) == [("robot/state", 3, 0)]
 
 
 def life(*entries: tuple[str, int], at_ms: int, seq: int, process: str = "decision") -> Sample:
     """Return the sample of an input log: these entries, a millisecond apart, from `at_ms` on."""
-    said = Said()
-    said.now_ns += at_ms * MS
+    recorded = RecordedLog()
+    recorded.now_ns += at_ms * MS
     for key, number in entries:
         if key == WAITED:
-            said.input_log.in_time(finished() if number else Future(), 0.0)
+            recorded.input_log.in_time(finished() if number else Future(), 0.0)
         else:
-            said.input_log.note(key, number)
-        said.now_ns += 1 * MS
-    said.input_log.flush()
-    word = replace(said.words[0], seq=seq, stamp_ns=said.now_ns)
-    return sample(at_ms + 10, INPUT_LOG.at(process), codec.encode(word))
+            recorded.input_log.note(key, number)
+        recorded.now_ns += 1 * MS
+    recorded.input_log.flush()
+    message = replace(recorded.messages[0], seq=seq, stamp_ns=recorded.now_ns)
+    return sample(at_ms + 10, INPUT_LOG.at(process), codec.encode(message))
 
 
 def test_a_recording_is_put_into_the_order_of_the_process_without_what_it_passed_over() -> None:

@@ -1,4 +1,4 @@
-"""The robot's time: what one message may do to it, and what several may."""
+"""The robot's time: the effects of one message, and of several."""
 
 import asyncio
 
@@ -16,7 +16,7 @@ from gigabrain_zenoh.testing.in_memory import Net
 from gigabrain_zenoh.testing.samples import BOOT, open_space, scan, state
 
 SECOND_NS = 1_000_000_000
-FAR = 2**37
+FAR_FUTURE = 2**37
 
 
 @pytest.fixture
@@ -27,14 +27,14 @@ def time() -> RobotTime:
 
 
 def test_one_state_of_the_far_future_is_not_believed(time: RobotTime) -> None:
-    assert not time.observe(state(FAR))
+    assert not time.observe(state(FAR_FUTURE))
     assert time.tick == 100
     assert time.observe(state(101))
     assert time.tick == 101
 
 
 def test_one_scan_of_the_far_future_is_not_believed(time: RobotTime) -> None:
-    assert not time.observe(scan(open_space(), FAR))
+    assert not time.observe(scan(open_space(), FAR_FUTURE))
     assert time.tick == 100
 
 
@@ -50,7 +50,7 @@ def test_a_jump_ahead_is_believed_once_the_third_state_agrees(time: RobotTime) -
 
 def test_a_jump_is_not_believed_while_the_present_time_goes_on(time: RobotTime) -> None:
     for n in range(1, 50):
-        assert not time.observe(state(FAR + n))
+        assert not time.observe(state(FAR_FUTURE + n))
         assert time.observe(state(100 + n))
     assert time.tick == 149
 
@@ -75,7 +75,7 @@ def test_one_state_of_another_boot_changes_nothing(time: RobotTime) -> None:
 
 
 def test_a_message_that_several_here_listen_to_counts_once(time: RobotTime) -> None:
-    assert not any(time.observe(state(FAR)) for _ in range(10))
+    assert not any(time.observe(state(FAR_FUTURE)) for _ in range(10))
 
 
 def test_a_first_tick_that_is_repeated_until_the_brain_is_there_is_believed(
@@ -101,28 +101,28 @@ def test_what_came_before_is_still_known_after_a_message_of_the_future() -> None
     def place(tick: int) -> PoseInMap:
         return PoseInMap(x=0.0, y=0.0, yaw=0.0, covariance=(0.0,) * 9, boot=BOOT, tick=tick)
 
-    for tick in (10, FAR, 15):
+    for tick in (10, FAR_FUTURE, 15):
         places.receive(place(tick))
     assert places.at(BOOT, 15, SECOND_NS) == place(10)
     assert places.at(BOOT, 16, SECOND_NS) == place(15)
 
 
-def say(net: Net, message: RobotState) -> None:
+def deliver_state(net: Net, message: RobotState) -> None:
     net.network.deliver(STATE.key, codec.encode(message))
 
 
 async def test_who_refuses_every_state_for_three_seconds_says_so_and_ends() -> None:
     net = Net()
     states = net.one.latest(STATE)
-    say(net, state(FAR))  # the first message is accepted
+    deliver_state(net, state(FAR_FUTURE))  # the first message is accepted
     for tick in range(1, 149):
-        say(net, state(tick))
+        deliver_state(net, state(tick))
         await net.clock.advance(20_000_000)
     assert not net.one.failed.done()
     for tick in range(149, 155):
-        say(net, state(tick))
+        deliver_state(net, state(tick))
         await net.clock.advance(20_000_000)
-    assert states.newest == state(FAR)
+    assert states.newest == state(FAR_FUTURE)
     with pytest.raises(ClockLost, match=r"every robot/state has been refused for 3 s.* tick 152"):
         net.one.failed.result()
 
@@ -130,9 +130,9 @@ async def test_who_refuses_every_state_for_three_seconds_says_so_and_ends() -> N
 async def test_a_lie_now_and_then_ends_nobody() -> None:
     net = Net()
     net.one.latest(STATE)
-    say(net, state(1))
+    deliver_state(net, state(1))
     for n in range(20):
-        say(net, state(FAR, boot=n + 20))
+        deliver_state(net, state(FAR_FUTURE, boot=n + 20))
         await net.clock.advance(2 * SECOND_NS)
     assert not net.one.failed.done()
 
@@ -141,8 +141,8 @@ async def test_a_lie_reaches_no_reader_and_is_counted() -> None:
     net = Net()
     received = list[int]()
     net.one.latest(STATE, lambda state: received.append(state.tick))
-    for tick in (100, FAR, 101):
-        say(net, state(tick))
+    for tick in (100, FAR_FUTURE, 101):
+        deliver_state(net, state(tick))
     await asyncio.sleep(0)
     assert received == [100, 101]
     assert net.one.counters["refused_ticks"] == 1
@@ -151,12 +151,12 @@ async def test_a_lie_reaches_no_reader_and_is_counted() -> None:
 async def test_who_looks_seldom_confirms_a_jump_by_what_has_come_meanwhile() -> None:
     net = Net()
     sampled = Sampled(net.one, STATE)
-    say(net, state(100))
+    deliver_state(net, state(100))
     assert sampled.poll() == state(100)
     for tick in (500, 501, 502):
-        say(net, state(tick))
+        deliver_state(net, state(tick))
     assert sampled.poll() == state(500)
-    say(net, state(FAR))
+    deliver_state(net, state(FAR_FUTURE))
     assert sampled.poll() is None
-    say(net, state(503))
+    deliver_state(net, state(503))
     assert sampled.poll() == state(503)

@@ -1,4 +1,4 @@
-"""Control's step with a body that does as it is told."""
+"""Control's step with a simple body that drives straight or turns."""
 
 import math
 
@@ -23,15 +23,15 @@ def want(v: float = 0.0, w: float = 0.0, *, basis: int = 1) -> Intent:
 
 
 class Drive:
-    """Control, and a body that goes `gain` times as fast as it is told: late, and by and by."""
+    """Control, and a body with a gain, and a first-order lag, from commanded to real speed."""
 
     def __init__(
         self, body: BodyDescription = WAFFLE, *, gain: float = 1.0, lag_s: float = 0.0
     ) -> None:
         self.body, self.memory, self.tick = body, ControlMemory(), 0
-        self._gain, self._follows = gain, 1 - math.exp(-0.02 / lag_s) if lag_s else 1.0
+        self._gain, self._response = gain, 1 - math.exp(-0.02 / lag_s) if lag_s else 1.0
         self.v = self.w = 0.0
-        self._told = CmdVel(linear_x=0.0)
+        self._command = CmdVel(linear_x=0.0)
 
     def go(
         self,
@@ -45,14 +45,14 @@ class Drive:
     ) -> CmdVel:
         """One tick."""
         self.tick += ticks_passed
-        self.v += (self._gain * self._told.linear_x - self.v) * self._follows
-        self.w += (self._gain * self._told.angular_z - self.w) * self._follows
+        self.v += (self._gain * self._command.linear_x - self.v) * self._response
+        self.w += (self._gain * self._command.angular_z - self.w) * self._response
         measured = state(self.tick, v=self.v, w=self.w, gate=gate, boot=boot)
         inputs = ControlInputs(
             state=measured, intent=intent, teleop=teleop, caps=caps or SpeedCaps()
         )
-        self.memory, self._told = step(self.body, self.memory, inputs)
-        return self._told
+        self.memory, self._command = step(self.body, self.memory, inputs)
+        return self._command
 
     def speeds(
         self, ticks: int, intent: Intent | None = None, *, caps: SpeedCaps | None = None

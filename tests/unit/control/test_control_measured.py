@@ -55,8 +55,8 @@ def test_nothing_winds_up_while_a_cap_holds_the_body_back() -> None:
     learnt = drive.memory.gain_x
     assert learnt == pytest.approx(1 / 0.9, abs=0.01)
     for _ in range(500):  # the gate clamps to the cap
-        told = drive.go(want(0.2), caps=SpeedCaps(forward=0.1))
-        drive._told = replace(told, linear_x=min(told.linear_x, 0.1))
+        command = drive.go(want(0.2), caps=SpeedCaps(forward=0.1))
+        drive._command = replace(command, linear_x=min(command.linear_x, 0.1))
     assert drive.v == pytest.approx(0.09, abs=0.001)
     assert drive.memory.gain_x == pytest.approx(learnt, abs=0.01)
     released = []

@@ -34,8 +34,8 @@ def test_what_the_body_will_do_with_commands_on_their_way_is_foreseen() -> None:
         seen.append((plant.pose, plant.velocity, plant.memory.sent))
         plant.go(intent if i else None)
     pose, velocity, _ = seen[100]
-    told = seen[101][2]  # before that state
-    found = predict(pose, velocity, told, 5, SLOW)
+    sent = seen[101][2]  # before that state
+    found = predict(pose, velocity, sent, 5, SLOW)
     later = seen[105][0]
     assert (found.x, found.y, found.yaw) == pytest.approx((later.x, later.y, later.yaw), abs=1e-3)
 
@@ -107,13 +107,13 @@ def test_caps_of_safety_and_the_bodys_limits_hold_on_a_trajectory_too() -> None:
     before, caps = 0.0, SpeedCaps(forward=0.2, rotation=0.3)
     for i in range(200):
         intent = course.intent(plant.tick, SLOW)
-        told = plant.go(intent, caps if i >= 100 else None)
-        assert abs(told.linear_x - before) <= 2.0 * 0.02 + 1e-9
-        assert told.linear_x <= 1.0
-        assert told.angular_z <= 1.82
-        before = told.linear_x
-    assert 0.15 < told.linear_x <= 0.2
-    assert 0.2 < told.angular_z <= 0.3
+        command = plant.go(intent, caps if i >= 100 else None)
+        assert abs(command.linear_x - before) <= 2.0 * 0.02 + 1e-9
+        assert command.linear_x <= 1.0
+        assert command.angular_z <= 1.82
+        before = command.linear_x
+    assert 0.15 < command.linear_x <= 0.2
+    assert 0.2 < command.angular_z <= 0.3
 
 
 def test_asked_again_within_a_tick_it_answers_the_same() -> None:

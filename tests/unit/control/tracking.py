@@ -63,7 +63,7 @@ class Course:
 
 
 class Plant:
-    """A body that answers after a delay, by and by; control, and its gate at rest at first."""
+    """Control, and a body with a delay and a first-order lag, at rest at first."""
 
     def __init__(
         self,
@@ -75,7 +75,7 @@ class Plant:
     ) -> None:
         self.body, self.memory, self.tick = body, ControlMemory(), 0
         self.pose, self.velocity = Pose(x=0.0, y=0.0, yaw=0.0), Velocity()
-        self._late = deque([CmdVel(linear_x=0.0)] * round(response.delay / 0.02))
+        self._delayed = deque([CmdVel(linear_x=0.0)] * round(response.delay / 0.02))
         self._follows = 1 - math.exp(-0.02 / response.lag) if response.lag else 1.0
         self._gain, self._slip = gain, slip
 
@@ -87,9 +87,9 @@ class Plant:
         inputs = ControlInputs(
             state=replace(now, velocity=v), intent=intent, caps=caps or SpeedCaps()
         )
-        self.memory, told = step(self.body, self.memory, inputs)
-        self._late.append(told)
-        acts, share = self._late.popleft(), self._follows
+        self.memory, command = step(self.body, self.memory, inputs)
+        self._delayed.append(command)
+        acts, share = self._delayed.popleft(), self._follows
         self.velocity = v = Velocity(
             linear_x=v.linear_x + share * (self._gain * acts.linear_x - v.linear_x),
             linear_y=v.linear_y + share * (self._gain * acts.linear_y - v.linear_y),
@@ -100,7 +100,7 @@ class Plant:
         middle = replace(pose, yaw=pose.yaw + turned / 2)
         move = Pose(x=v.linear_x * 0.02, y=v.linear_y * 0.02, yaw=turned / 2)
         self.pose = compose(middle, move)
-        return told
+        return command
 
 
 def errors(
