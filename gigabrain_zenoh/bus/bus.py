@@ -84,14 +84,14 @@ class Bus:
         self.problems: tuple[Cause, ...] = ()  # the node's present problems, for its health
         self.latency_ms: dict[str, float] = {}  # measured by the node, for its health
         self.report: Callable[[], Mapping[str, float | int | str | None]] = dict
-        self.input_log = InputLogger()  # inputs that the node has used
+        self.input_log = InputLogger()  # inputs that the node used
         self.params = Params()  # may change while the process runs
         self.arrived: dict[str, tuple[int, int]] = {}  # boot and tick of the newest message, by key
         # returns whether work was done since the last call; by default True, as the loop runs
         self.progress: Callable[[], bool] = lambda: True
         self._refusing_since_ns = self._last_state_ns = 0
         self.closed = False
-        self._kept: dict[str, bytes] = {}
+        self._kept_payloads: dict[str, bytes] = {}
         self._fetch_tasks: set[asyncio.Task[None]] = set()
 
     def publish(
@@ -104,7 +104,7 @@ class Bus:
         tick: int | None = None,
         stamp_ns: int | None = None,
     ) -> M:
-        """Send `message` with its header filled in; returns what was sent.
+        """Fill in the header of `message`, and publish it; return the published message.
 
         `tick` and `stamp_ns` are the present ones, unless given for an earlier measurement.
         """
@@ -120,7 +120,7 @@ class Bus:
         )
         payload, encoding = codec.encode(stamped), codec.encoding_of(topic.type)
         if topic.keep:
-            self._keep(key, payload, encoding)
+            self._keep_payload(key, payload, encoding)
         self.transport.publish(topic, key, payload, encoding)
         return stamped
 
@@ -303,12 +303,13 @@ class Bus:
         if error is failed:
             error.__traceback__ = traceback
 
-    def _keep(self, key: str, payload: bytes, encoding: str) -> None:
-        first = key not in self._kept
-        self._kept[key] = payload
+    def _keep_payload(self, key: str, payload: bytes, encoding: str) -> None:
+        """Store the newest payload of `key`, and serve it to late subscribers."""
+        first = key not in self._kept_payloads
+        self._kept_payloads[key] = payload
 
         async def answer(_payload: bytes) -> tuple[bytes, str]:
-            return self._kept[key], encoding
+            return self._kept_payloads[key], encoding
 
         if first:
             self.transport.serve(key, answer)

@@ -135,7 +135,7 @@ def _next_tick(
         return memory, 0
     passed = max(0, min(state.tick - memory.tick, MAX_STEP_TICKS))
     calm = state.tick - memory.enabled_tick <= CALM_TICKS
-    deviates = [
+    deviating = [
         calm or abs(sent - point.position) > MAX_DEVIATION_TICKS * TICK_S * joint.max_speed
         for sent, point, joint in zip(memory.sent, posture, body.joints, strict=True)
     ]
@@ -144,7 +144,7 @@ def _next_tick(
         moved = (posture[k].position - memory.obeyed[k]) / (max(1, passed) * TICK_S)
         if abs(moved) <= MAX_SPEED_FACTOR * joint.max_speed:  # otherwise it was turned by hand
             speeds[k] = moved
-    memory = _from_sent(body, memory, here, posture, deviates, speeds)
+    memory = _resume_from_gate(body, memory, here, posture, deviating, speeds)
     memory = replace(memory, tick=state.tick, obeyed=_places(posture))
     return memory, 0 if calm else passed
 
@@ -157,11 +157,11 @@ def _brake(
 ) -> tuple[JointMemory, JointCommand]:
     """Let the gate brake and hold the joints, while decision is silent."""
     names, still = tuple(joint.name for joint in body.joints), (0.0,) * len(posture)
-    memory = _from_sent(body, memory, here, posture, [True] * len(posture), still)
+    memory = _resume_from_gate(body, memory, here, posture, [True] * len(posture), still)
     return memory, JointCommand(name=names, velocity=still)
 
 
-def _from_sent(
+def _resume_from_gate(
     body: BodyDescription,
     memory: JointMemory,
     here: tuple[JointPoint, ...],

@@ -39,9 +39,11 @@ class Lockstep:
 
     def __init__(self, period_ticks: int = 1, timeout_s: float = TIMEOUT_S) -> None:
         self._timeout_s = timeout_s
-        self._period = period_ticks  # of control's commands
-        self._tick = self._basis = self._newest = 0
-        self._echoed = self._echo_basis = self._judged_basis = 0
+        self._period_ticks = period_ticks  # from one command of control to the next
+        self._announced_tick = 0
+        self._command_tick = 0  # tick that a command has to echo
+        self._scan_tick = 0  # tick that it has to be based on
+        self._echoed = self._echo_basis = self._judged_basis = 0  # the newest received
         self._safety_tick = 0  # tick of the newest verdict
         self._required_tick = 0  # oldest tick of a verdict that suffices
         self._exposed: dict[str, int] = {}  # tick of each camera's newest exposure
@@ -57,7 +59,8 @@ class Lockstep:
         `exposed` are the cameras that take a picture in this tick.
         """
         self._exposed.update(dict.fromkeys(exposed, tick))
-        self._tick, self._basis, self._newest = tick - tick % self._period, basis, tick
+        self._announced_tick, self._scan_tick = tick, basis
+        self._command_tick = tick - tick % self._period_ticks
         # safety need not repeat its verdict in every tick
         self._required_tick = max(1, tick - REPEAT_TICKS + 1)
         self._wake.clear()
@@ -67,7 +70,7 @@ class Lockstep:
 
         A command that echoes a future tick is ignored.
         """
-        if max(command.tick, command.basis) > self._newest:
+        if max(command.tick, command.basis) > self._announced_tick:
             return
         self._echoed = max(self._echoed, command.tick)
         basis = command.basis if command.source == BRAIN else command.tick
@@ -77,7 +80,7 @@ class Lockstep:
     def verdict(self, verdict: SafetyState) -> None:
         """Note a verdict of safety."""
         silent = any(cause.code in BRAIN_SILENT for cause in verdict.causes)
-        if silent or max(verdict.tick, verdict.basis) > self._newest:
+        if silent or max(verdict.tick, verdict.basis) > self._announced_tick:
             return
         self._judged_basis = max(self._judged_basis, verdict.basis)
         self._safety_tick = max(self._safety_tick, verdict.tick)
@@ -85,7 +88,7 @@ class Lockstep:
 
     def picture(self, camera: str, basis: int) -> None:
         """Note a picture, or the notice that it is withheld."""
-        if basis <= self._newest:
+        if basis <= self._announced_tick:
             self._pictures[camera] = max(self._pictures.get(camera, 0), basis)
             self._wake.set()
 
@@ -96,7 +99,7 @@ class Lockstep:
     def world(self, world: WorldModel) -> None:
         """Note the contours of a world."""
         for camera in world.cameras:
-            if camera.ok and 0 < camera.exposure <= self._newest:
+            if camera.ok and 0 < camera.exposure <= self._announced_tick:
                 self._contours[camera.name] = camera.exposure
             elif not camera.ok:  # it will get no contours
                 self._contours.pop(camera.name, None)
@@ -109,9 +112,9 @@ class Lockstep:
 
     def _missing(self) -> Iterator[str]:
         """Yield descriptions of what has not arrived."""
-        if self._echoed < self._tick or self._echo_basis < self._basis:
+        if self._echoed < self._command_tick or self._echo_basis < self._scan_tick:
             yield "a command"
-        if self._judged_basis < self._basis or self._safety_tick < self._required_tick:
+        if self._judged_basis < self._scan_tick or self._safety_tick < self._required_tick:
             yield "a verdict of safety"
         for name, tick in self._exposed.items():
             if self._pictures.get(name, 0) < tick:
@@ -144,7 +147,7 @@ class Lockstep:
             self.timeouts += 1
             missing = ", ".join(self._missing())
             self._fault.begin(
-                f"tick {self._newest} went on after {self._timeout_s:g} s without {missing}"
+                f"tick {self._announced_tick} went on after {self._timeout_s:g} s without {missing}"
             )
             return
 
