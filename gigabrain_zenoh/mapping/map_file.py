@@ -1,8 +1,8 @@
 """Map files: ROS's PGM and YAML, and the pose graph as bounded .npz arrays.
 
-All files of a save appear at once: they are written into a folder whose renaming decides. The next
-reader finishes what a crash left. Arrays are bounded before they are read: a zip may hold a
-thousand times its own size.
+All files of a save appear at once: they are written into a folder, which is then renamed. The next
+reader finishes a save that a crash interrupted. Sizes are checked before arrays are read: a zip may
+hold a thousand times its own size.
 """
 
 import hashlib
@@ -33,25 +33,25 @@ from gigabrain_zenoh.host.files import (
 from gigabrain_zenoh.host.run_folders import state_dir
 
 OCCUPIED, FREE, UNKNOWN = 0, 254, 205  # grey values, as ROS's map_server writes them
-OCCUPIED_PERCENT, FREE_PERCENT = 65, 40  # from here on, and up to here
-MIN_FREE_M2, MIN_WALL_M = 1.0, 1.0  # less than that is no map
+OCCUPIED_PERCENT, FREE_PERCENT = 65, 40  # occupied from 65 on, free up to 40
+MIN_FREE_M2, MIN_WALL_M = 1.0, 1.0  # of a map that is worth saving
 GRAPH = ".graph.npz"
 ZONES = ".zones.yaml"  # see zone_file
 OBJECTS = ".objects.json"  # see object_file
-EMPTY = b"{}\n"  # a file of no zones or objects
-STAMP = "grid"  # in the graph's file: which grid it belongs to
+EMPTY_FILE = b"{}\n"  # without zones or objects
+GRID_HASH = "grid"  # name in the graph's file, which belongs to this grid
 
 Arrays = Mapping[str, NDArray[Any]]
-MAX_ARRAY_BYTES = 80_000_000  # of all arrays of a file together
+MAX_ARRAY_BYTES = 80_000_000  # of all arrays in a file
 MAX_ARRAYS = 64
-DIRECTORY_BYTES = 512  # of a zip's directory, for each array
+DIRECTORY_BYTES = 512  # of a zip's directory, per array
 ZIP_END, ZIP_END_BYTES, MAX_COMMENT_BYTES = b"PK\5\6", 22, 65_535  # of a zip's end record
-MAX_NUMBER = 1e9  # of any number, as on the bus
+MAX_NUMBER = 1e9  # as on the bus
 NPY_HEADERS = {
     (1, 0): np.lib.format.read_array_header_1_0,
     (2, 0): np.lib.format.read_array_header_2_0,
 }
-# all that zipfile, zlib and numpy's reading of headers raise on hostile input
+# raised by zipfile, zlib and numpy's header readers for hostile input
 READ_ERRORS = (
     ValueError, EOFError, KeyError, OSError, TypeError, NotImplementedError, RuntimeError,
     SyntaxError, OverflowError, MemoryError, struct.error, tokenize.TokenError, zlib.error,
@@ -60,7 +60,7 @@ READ_ERRORS = (
 
 
 def path_of(name: str) -> Path:
-    """Return the YAML file of a map by its name, or by its path if it looks like one."""
+    """Return the path of a map's YAML file: of a saved map's name, or a path as it is."""
     if "/" in name or name.endswith((".yaml", ".yml")):
         return Path(name)
     return saved_map_path(name)
@@ -72,30 +72,30 @@ def folder() -> Path:
 
 
 def saved_map_path(name: str) -> Path:
-    """Return the YAML file of a saved map's name."""
+    """Return the path of a saved map's YAML file."""
     return folder() / f"{name}.yaml"
 
 
 def in_words(found: SavedMap) -> str:
     """Return the size of a map as text."""
     height, width = (cells * found.resolution for cells in found.cells.shape)
-    area = np.count_nonzero(_free(found)) * found.resolution**2
+    area = np.count_nonzero(_free_cells(found)) * found.resolution**2
     return f"{width:.1f} x {height:.1f} m, {area:.1f} m² of it free"
 
 
 def load(path: Path) -> SavedMap:
-    """Load the map that a YAML file describes. Raises ConfigError, in one line."""
-    _finish(path)
+    """Load the map of a YAML file. Raises ConfigError, in one line."""
+    _finish_save(path)
     return map_image.load(path)
 
 
 def load_graph(path: Path) -> dict[str, NDArray[Any]]:
     """Load the pose graph beside the YAML file `path`. Raises ConfigError, in one line."""
-    _finish(path)
+    _finish_save(path)
     file = path.with_suffix(GRAPH)
     graph = read_arrays(file, "the pose graph to go on with; expected it beside the YAML file")
-    stamp = graph.pop(STAMP, None)
-    if stamp is not None and not np.array_equal(stamp, _stamp(load(path))):
+    grid_hash = graph.pop(GRID_HASH, None)
+    if grid_hash is not None and not np.array_equal(grid_hash, _grid_hash(load(path))):
         raise ConfigError(
             f"{file}: belongs to another map than {path}; bring back what was saved together, "
             "or find the way in that map as it is (mapping: localize)"
@@ -112,33 +112,35 @@ def save(
     zones: bytes = b"",
     objects: bytes | None = b"",
 ) -> None:
-    """Write `path`, a YAML file's, and its image, graph, zones and objects. All of it, or nothing.
+    """Write the YAML file `path` and its image, graph, zones and objects: all of them, or none.
 
-    With `objects` None, those that are there stay; otherwise nothing of a replaced map does.
-    Raises Refused for an unusable map, or if a map is there and `replace` is False.
+    If `objects` is None, existing ones stay; a replaced map leaves nothing else. Raises Refused
+    for an unusable map, or if a map exists and `replace` is False.
     """
     problem = map_problem(found)
     if problem:
         raise Refused(f"not saved: {problem}")
     try:
         make_folder(path.parent)
-        _finish(path)
+        _finish_save(path)
         if path.exists() and not replace:
             raise Refused(f"not saved: there is a map {path} already; --replace overwrites it")
-        ends = ((ZONES, zones), (OBJECTS, objects))
-        beside = {path.with_suffix(end): data for end, data in ends if data is not None}
-        more = {file.name: data or EMPTY for file, data in beside.items() if data or file.exists()}
-        _commit(path, {**_files(path, found, graph), **more})
+        endings = ((ZONES, zones), (OBJECTS, objects))
+        beside = {path.with_suffix(end): data for end, data in endings if data is not None}
+        more = {
+            file.name: data or EMPTY_FILE for file, data in beside.items() if data or file.exists()
+        }
+        _write_all(path, {**_files(path, found, graph), **more})
     except ValueError as error:
         raise Refused(f"not saved: {error}") from None
     except OSError as error:
         raise Refused(f"not saved: {error.filename or path}: {error.strerror}") from None
-    _finish(path)
+    _finish_save(path)
 
 
 def map_problem(found: SavedMap) -> str:
-    """Return why a map is not worth saving, or an empty text."""
-    area = np.count_nonzero(_free(found)) * found.resolution**2
+    """Return the reason why a map is not worth saving, or an empty text."""
+    area = np.count_nonzero(_free_cells(found)) * found.resolution**2
     if area < MIN_FREE_M2:
         return f"the map is empty: {area:.2f} m² of it are free"
     length = np.count_nonzero(found.cells >= OCCUPIED_PERCENT) * found.resolution
@@ -147,49 +149,49 @@ def map_problem(found: SavedMap) -> str:
     return ""
 
 
-def _free(found: SavedMap) -> NDArray[np.bool_]:
+def _free_cells(found: SavedMap) -> NDArray[np.bool_]:
     return (found.cells >= 0) & (found.cells <= FREE_PERCENT)
 
 
-def _stamp(found: SavedMap) -> NDArray[np.uint8]:
+def _grid_hash(found: SavedMap) -> NDArray[np.uint8]:
     """Return a hash that identifies a saved grid."""
-    full = np.where(found.cells >= OCCUPIED_PERCENT, 100, -1)
-    place = f"{found.resolution:.12g} {found.origin_x:.12g} {found.origin_y:.12g}"
-    cells = np.where(_free(found), 0, full).astype(np.int8)
-    whole = f"{place} {cells.shape}".encode() + cells.tobytes()
-    return np.frombuffer(hashlib.sha256(whole).digest(), np.uint8)
+    occupied = np.where(found.cells >= OCCUPIED_PERCENT, 100, -1)
+    geometry = f"{found.resolution:.12g} {found.origin_x:.12g} {found.origin_y:.12g}"
+    cells = np.where(_free_cells(found), 0, occupied).astype(np.int8)
+    hashed = f"{geometry} {cells.shape}".encode() + cells.tobytes()
+    return np.frombuffer(hashlib.sha256(hashed).digest(), np.uint8)
 
 
 def _files(path: Path, found: SavedMap, graph: Arrays) -> dict[str, bytes]:
     height, width = found.cells.shape
     grey = np.full((height, width), UNKNOWN, np.uint8)
     grey[found.cells >= OCCUPIED_PERCENT] = OCCUPIED
-    grey[_free(found)] = FREE
+    grey[_free_cells(found)] = FREE
     image = path.with_suffix(".pgm").name
-    about = (
+    description = (
         f"image: {image}\nresolution: {found.resolution:.12g}\n"
         f"origin: [{found.origin_x:.12g}, {found.origin_y:.12g}, 0.0]\n"
         "negate: 0\noccupied_thresh: 0.65\nfree_thresh: 0.196\n"
     )
     return {
         image: b"P5\n%d %d\n255\n" % (width, height) + grey[::-1].tobytes(),
-        path.with_suffix(GRAPH).name: arrays_bytes({**graph, STAMP: _stamp(found)}),
-        path.name: about.encode(),
+        path.with_suffix(GRAPH).name: arrays_bytes({**graph, GRID_HASH: _grid_hash(found)}),
+        path.name: description.encode(),
     }
 
 
-def _commit(path: Path, files: Mapping[str, bytes]) -> None:
-    """Bring all `files` safely to disk; after that they will be in their places, come what may."""
+def _write_all(path: Path, files: Mapping[str, bytes]) -> None:
+    """Write all `files` durably; from then on _finish_save can put them in their places."""
     draft = path.with_name(f".{path.stem}.draft")
-    if draft.exists():  # of a save that was interrupted
+    if draft.exists():  # from an interrupted save
         shutil.rmtree(draft)
     draft.mkdir()
     try:
         _write(draft, files)
     except OSError:
-        shutil.rmtree(draft, ignore_errors=True)  # or a full disk would stay full
+        shutil.rmtree(draft, ignore_errors=True)  # a full disk would stay full
         raise
-    draft.rename(_complete(path))
+    draft.rename(_complete_folder(path))
     sync_folder(path.parent)
 
 
@@ -199,28 +201,28 @@ def _write(folder: Path, files: Mapping[str, bytes]) -> None:
     sync_folder(folder)
 
 
-def _finish(path: Path) -> None:
-    """Put the files of a complete save in their places. Raises ConfigError where it cannot."""
-    complete = _complete(path)
-    if not os.path.isdir(complete):  # Path's raises where a folder may not be looked into
+def _finish_save(path: Path) -> None:
+    """Move the files of a complete save to their places. Raises ConfigError if that fails."""
+    complete = _complete_folder(path)
+    if not os.path.isdir(complete):  # Path.is_dir raises in a forbidden folder
         return
     try:
         for file in complete.iterdir():
             file.rename(path.with_name(file.name))
         sync_folder(path.parent)
         complete.rmdir()
-    except FileNotFoundError:  # another process has finished it
+    except FileNotFoundError:  # another process finished it
         return
     except OSError as error:
         raise ConfigError(f"{complete}: an unfinished save: {error.strerror}") from None
 
 
-def _complete(path: Path) -> Path:
+def _complete_folder(path: Path) -> Path:
     return path.with_name(f".{path.stem}.complete")
 
 
 def read_arrays(path: Path, what: str, only: str = "") -> dict[str, NDArray[Any]]:
-    """Read the arrays of a file, or `only` one of them; `what` names the file's content.
+    """Read the arrays of a file, or only the array `only`; `what` names the content in errors.
 
     Raises ConfigError, in one line.
     """
@@ -235,7 +237,7 @@ def read_arrays(path: Path, what: str, only: str = "") -> dict[str, NDArray[Any]
 
 
 def write_arrays(file: BinaryIO, arrays: Arrays, *, compress: bool) -> None:
-    """Write `arrays` to `file`. Raises OSError, and ValueError for more than can be read."""
+    """Write `arrays` to `file`. Raises OSError, and ValueError if they are too large to read."""
     size = sum(values.nbytes for values in arrays.values())
     if size > MAX_ARRAY_BYTES * 0.99:  # the headers count too
         raise ValueError(
@@ -246,7 +248,7 @@ def write_arrays(file: BinaryIO, arrays: Arrays, *, compress: bool) -> None:
 
 
 def arrays_bytes(arrays: Arrays) -> bytes:
-    """Return the content of a compressed file. Raises ValueError, as `write_arrays` does."""
+    """Return `arrays` as a compressed file. Raises ValueError like `write_arrays`."""
     content = io.BytesIO()
     write_arrays(content, arrays, compress=True)
     return content.getvalue()
@@ -269,19 +271,19 @@ def _read_zip(file: BinaryIO, only: str) -> dict[str, NDArray[Any]]:
 
 
 def _directory_bytes(file: BinaryIO) -> int:
-    """Return how large the zip's directory is, by its end record (APPNOTE.TXT, 4.3.16) [bytes]."""
+    """Return the size of the zip's directory, from its end record (APPNOTE.TXT, 4.3.16) [bytes]."""
     size = file.seek(0, os.SEEK_END)
     file.seek(max(0, size - ZIP_END_BYTES - MAX_COMMENT_BYTES))
     tail = file.read()
     file.seek(0)
-    at = len(tail) - ZIP_END_BYTES
-    if tail[at : at + 4] != ZIP_END or tail[-2:] != b"\0\0":
-        at = tail.rfind(ZIP_END)
-    if at < 0 or len(tail) - at < ZIP_END_BYTES:
-        return 0  # no zip, as zipfile will say
-    if b"PK\6\7" in tail[max(0, at - 20) : at]:
+    end = len(tail) - ZIP_END_BYTES
+    if tail[end : end + 4] != ZIP_END or tail[-2:] != b"\0\0":
+        end = tail.rfind(ZIP_END)
+    if end < 0 or len(tail) - end < ZIP_END_BYTES:
+        return 0  # no zip: zipfile raises
+    if b"PK\6\7" in tail[max(0, end - 20) : end]:
         raise ValueError("it is a zip of the large format, which no map needs")
-    return int.from_bytes(tail[at + 12 : at + 16], "little")
+    return int.from_bytes(tail[end + 12 : end + 16], "little")
 
 
 def _read_array(name: str, members: zipfile.ZipFile, info: zipfile.ZipInfo) -> NDArray[Any]:
@@ -290,7 +292,7 @@ def _read_array(name: str, members: zipfile.ZipFile, info: zipfile.ZipInfo) -> N
         shape, fortran, dtype = NPY_HEADERS[np.lib.format.read_magic(stream)](stream)
         if dtype.kind not in "biuf" or min(shape, default=0) < 0:
             raise ValueError(f"{name} holds something else than numbers")
-        data = stream.read()  # no more than the zip says, which is bounded; and its checksum
+        data = stream.read()  # of bounded size; zipfile checks the checksum
     if len(data) != math.prod(shape) * dtype.itemsize:
         raise ValueError(f"{name}: {len(data)} bytes for {shape} of {dtype}")
     values: NDArray[Any] = np.frombuffer(data, dtype).reshape(shape, order="F" if fortran else "C")

@@ -7,13 +7,13 @@ from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.mapping import map_file, zone_file
 
 MAX_MAPS = 256
-MAX_NAME = 64
+MAX_NAME = 64  # characters
 
 
 def saved_maps(folder: Path | None = None) -> tuple[list[SavedMapInfo], int]:
-    """Return the saved maps by name, and how many more there are.
+    """Return the saved maps, sorted by name, and the number of maps left out.
 
-    A map that cannot be used has a `problem`. One whose name no message can carry is only counted.
+    An unusable map has a `problem`. Maps beyond MAX_MAPS or with unsendable names are left out.
     """
     folder = folder or map_file.folder()
     files = sorted(
@@ -45,10 +45,10 @@ def _info(path: Path) -> SavedMapInfo:
     )
 
 
-def as_line(one: SavedMapInfo) -> str:
+def as_line(info: SavedMapInfo) -> str:
     """Return a map as a line of text."""
-    if one.problem:
-        return f"{one.name:<16} cannot be used: {one.problem}"
-    size = f"{one.width * one.resolution:.1f} x {one.height * one.resolution:.1f} m"
-    graph = "mapping can continue" if one.graph else "for localization"
-    return f"{one.name:<16} {size}, {graph}, {zone_file.listed(one.zones, one.places)}"
+    if info.problem:
+        return f"{info.name:<16} cannot be used: {info.problem}"
+    size = f"{info.width * info.resolution:.1f} x {info.height * info.resolution:.1f} m"
+    graph = "mapping can continue" if info.graph else "for localization"
+    return f"{info.name:<16} {size}, {graph}, {zone_file.listed(info.zones, info.places)}"

@@ -26,8 +26,8 @@ class ObjectFile(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
     def __post_init__(self) -> None:
         for name, ids in (
-            ("objects", [one.id for one in self.objects]),
-            ("tags", [one.id for one in self.tags]),
+            ("objects", [item.id for item in self.objects]),
+            ("tags", [item.id for item in self.tags]),
         ):
             if len(set(ids)) < len(ids):
                 raise ValueError(f"{name}: each needs an id of its own")
@@ -39,7 +39,7 @@ def path_beside(map_path: Path) -> Path:
 
 
 def load(map_path: Path) -> ObjectFile:
-    """Load the objects beside a map's YAML file; none without such a file. Raises ConfigError."""
+    """Load the objects beside a map's YAML file, if there are any. Raises ConfigError."""
     path = path_beside(map_path)
     try:
         return msgspec.json.decode(read_bounded(path, MAX_BYTES), type=ObjectFile)

@@ -1,4 +1,4 @@
-"""A map that grows while the robot drives, and is redrawn after a loop corrects it."""
+"""A map that grows while the robot drives, and is redrawn after loop closures."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -35,15 +35,15 @@ from gigabrain_zenoh.mapping.pose_hint import PoseHint, better, far_from
 from gigabrain_zenoh.mapping.slam import Correction, Estimate, Slam
 from gigabrain_zenoh.mapping.static_map import warm_up as warm_up_localizing
 
-DRAWN_SCANS = 5  # every so many scans one is drawn, and every keyframe
-DRAWN_AT_ONCE = 8  # sweeps, of those that wait after the map was redrawn
-LOOP_SCANS, KEYFRAME_SCANS, SWEEPS_A_SCAN = 5, 2, 200  # how long the work beside may take
-SHIFT_M, SHIFT_RAD = 0.02, 0.004  # keyframes that moved less need not be redrawn
+DRAW_INTERVAL_SCANS = 5  # keyframes are drawn in addition
+MAX_SWEEPS_PER_SCAN = 8  # to draw, of those that wait after the map was redrawn
+LOOP_SCANS, KEYFRAME_SCANS, SWEEPS_PER_SCAN = 5, 2, 200  # deadline of background work
+SHIFT_M, SHIFT_RAD = 0.02, 0.004  # the map is redrawn if a keyframe moved farther
 RATES = DriftRates(away=0.008, turn=0.002)  # of scans every few centimetres, guided by odometry
-LOOKED_SCANS = 5  # between two looks at where a hint says that the robot is
-FITS = ("matched", "recovered")  # scans that were found otherwise are not drawn
+HINT_INTERVAL_SCANS = 5  # between checks of hints
+FITTING_KINDS = ("matched", "recovered")  # other scans are not drawn
 
-LOOKING = "looking for the robot in the map"
+SEARCHING = "looking for the robot in the map"
 SAVE_AND_GO_ON = "save the map, and start perception with it (map: NAME)"
 FULL = Cause(
     code="map_full",
@@ -54,15 +54,15 @@ FULL = Cause(
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MapSnapshot:
-    """A map as it was at one scan; it can be put into arrays in another thread."""
+    """A copy of a map at one scan; another thread may convert it to arrays."""
 
-    pose: Floats | None  # (3,), of the robot at that scan, as far as odometry knows it
-    lost: bool  # it was looked for
+    pose: Floats | None  # (3,), of the robot by odometry, if known
+    lost: bool  # the robot was searched for
     slam: Slam
     sweeps: GridScans
     grid: LogOddsGrid
-    drawn: list[Floats]  # poses of the keyframes, as they are in the grid
-    waiting: list[GridScan]  # to be drawn
+    drawn: list[Floats]  # poses of the keyframes in the grid
+    waiting: list[GridScan]  # not yet drawn
 
     def freeze(self) -> dict[str, NDArray[np.generic]]:
         """Return everything needed to continue exactly, as arrays."""
@@ -88,7 +88,7 @@ class MapSnapshot:
 
     @property
     def changes(self) -> tuple[int, int, int]:
-        """Differs from that of a copy in which something else is mapped."""
+        """Numbers that differ if the map differs."""
         return len(self.slam.keyframes), self.slam.revision, self.sweeps.seen
 
 
@@ -98,21 +98,21 @@ class SlamMap:
     def __init__(self, patience_s: float = PATIENCE_S, in_time: InTime = done) -> None:
         self._background = ScheduledWorker(patience_s, in_time)
         self._slam, self._sweeps, self._grid = Slam(rates=RATES), GridScans(), LogOddsGrid()
-        self._drawn: list[Floats] = []  # poses of keyframes, as they are in the grid
-        self._waiting: list[GridScan] = []  # to be drawn
-        self._undrawn = 0  # scans
+        self._drawn: list[Floats] = []  # poses of the keyframes in the grid
+        self._undrawn_sweeps: list[GridScan] = []
+        self._scans_since_drawn = 0
         self._settling = False
         self._finder: BackgroundLocalizer | None = None
-        self._doubt = KidnapDetector()
-        self._moved = IDENTITY  # since the last scan that was taken
-        self._doubted = False  # likewise
-        self._resumed = False  # no scan has come since it was thawed
-        self._last = Place(IDENTITY, NOWHERE, False, "no scan yet")
+        self._kidnap_detector = KidnapDetector()
+        self._motion = IDENTITY  # since the last scan that SLAM added
+        self._kidnap_suspected = False  # since then as well
+        self._just_resumed = False  # no scan since it was thawed
+        self._last_place = Place(IDENTITY, NOWHERE, False, "no scan yet")
         self._loops = self._renewals = 0
         self._hint: PoseHint | None = None  # of the next scan
-        self._unasked = LOOKED_SCANS  # scans since it has looked where a hint says it is
-        self._wanted = False  # a copy, as soon as nothing is under way beside
-        self._still: MapSnapshot | None = None
+        self._scans_since_hint = HINT_INTERVAL_SCANS  # that was checked
+        self._snapshot_wanted = False  # as soon as no background work runs
+        self._snapshot: MapSnapshot | None = None
 
     @classmethod
     def thaw(
@@ -126,31 +126,30 @@ class SlamMap:
     ) -> "SlamMap":
         """Continue a saved map.
 
-        The robot is at `last` (3,) if its odometry has continued since. If it was `lost`, or the
-        next scan does not belong there, the whole map is searched. Raises ConfigError for invalid
-        arrays.
+        The robot is at `last` (3,) if its odometry continued since. If it was `lost`, or the next
+        scan does not fit there, the whole map is searched. Raises ConfigError for invalid arrays.
         """
-        grown = cls(patience_s, in_time)
+        slam_map = cls(patience_s, in_time)
         try:
-            grown._slam = Slam.thaw(arrays, rates=RATES)
-            grown._sweeps = GridScans.thaw(arrays, grown._slam.poses)
+            slam_map._slam = Slam.thaw(arrays, rates=RATES)
+            slam_map._sweeps = GridScans.thaw(arrays, slam_map._slam.poses)
             if "grid_odds" in arrays:
-                grown._thaw_grid(arrays)
+                slam_map._thaw_grid(arrays)
             else:
-                grown._drawn = list(grown._slam.poses)
-                grown._grid = _rendered(grown._sweeps.all(), grown._drawn)
+                slam_map._drawn = list(slam_map._slam.poses)
+                slam_map._grid = _drawn_grid(slam_map._sweeps.all(), slam_map._drawn)
         except KeyError as error:
             raise ConfigError(f"no pose graph: it has no {error}") from None
-        except (ValueError, IndexError, TypeError, RuntimeError) as error:  # the last is gtsam's
+        except (ValueError, IndexError, TypeError, RuntimeError) as error:  # RuntimeError: gtsam
             text = " ".join(str(error).split())[:200]
             raise ConfigError(f"no pose graph: {text}") from None
         if last is None or lost:
-            grown.lose(LOOKING)
-            if grown._finder:
-                grown._finder.last = last
+            slam_map.lose(SEARCHING)
+            if slam_map._finder:
+                slam_map._finder.last = last
         else:
-            grown._moved, grown._resumed = between(grown._slam.pose, last), True
-        return grown
+            slam_map._motion, slam_map._just_resumed = between(slam_map._slam.pose, last), True
+        return slam_map
 
     def _thaw_grid(self, arrays: Arrays) -> None:
         """Restore the grid; KeyError or ValueError if the arrays do not belong together."""
@@ -161,67 +160,69 @@ class SlamMap:
         self._grid = LogOddsGrid.of(odds, known.astype(np.bool_), (x, y))
         self._drawn = list(shaped(arrays, "drawn", len(self._slam.keyframes), 3))
         sweeps = self._sweeps.all()
-        self._waiting = [sweeps[k] for k in arrays["undrawn"].astype(int)]
+        self._undrawn_sweeps = [sweeps[k] for k in arrays["undrawn"].astype(int)]
 
     def step(self, view: View, motion: Floats, noise: Floats) -> Place:
         """See RobotMap."""
         self._background.at_scan()
-        if self._wanted and self._background.idle:
-            self._wanted, self._still = False, self._copied()
+        if self._snapshot_wanted and self._background.idle:
+            self._snapshot_wanted, self._snapshot = False, self._copy()
         self._draw_waiting()
         hint, self._hint = self._hint, None
         if hint and not self._finder:
-            self._look_elsewhere(view, hint, compose(self._moved, motion))
+            self._check_hint(view, hint, compose(self._motion, motion))
         if self._finder:
             if hint:
                 self._finder.suggest(hint)
-            self._last = self._find(self._finder, view, motion, noise)
-            return self._last
-        self._moved = compose(self._moved, motion)
-        resumed, self._resumed = self._resumed, False
-        if self._doubtful(view):
-            self._doubted = True
+            self._last_place = self._search_robot(self._finder, view, motion, noise)
+            return self._last_place
+        self._motion = compose(self._motion, motion)
+        resumed, self._just_resumed = self._just_resumed, False
+        if self._contradicts_map(view):
+            self._kidnap_suspected = True
             if resumed:
-                self.lose(LOOKING)
-            return self._last
-        estimate = self._slam.add(view.scan, self._moved, None if self._doubted else noise)
-        self._moved, self._doubted = IDENTITY, False
+                self.lose(SEARCHING)
+            return self._last_place
+        estimate = self._slam.add(
+            view.scan, self._motion, None if self._kidnap_suspected else noise
+        )
+        self._motion, self._kidnap_suspected = IDENTITY, False
         if estimate.lost:
             self.lose("scans do not fit together any more")
-            return self._last
-        self._take(view, estimate)
+            return self._last_place
+        self._draw_if_due(view, estimate)
         if self._slam.behind and self._background.idle and not self._settling:
             self._close_loops(self._slam.behind)
-        self._last = Place(estimate.pose, estimate.covariance, True)
-        return self._last
+        self._last_place = Place(estimate.pose, estimate.covariance, True)
+        return self._last_place
 
     def lose(self, why: str) -> None:
-        """See RobotMap. The robot may still be where odometry has it."""
+        """See RobotMap. The robot may still be at its pose by odometry."""
         if not self._slam.keyframes:
             return
         origin = (self._grid.origin_x, self._grid.origin_y)
         field = field_of(self._grid.percent(), CELL, origin)
-        self._finder = BackgroundLocalizer(field, why, self._background, self._here())
-        self._last = Place(self._last.pose, NOWHERE, False, why)
+        self._finder = BackgroundLocalizer(field, why, self._background, self._pose_by_odometry())
+        self._last_place = Place(self._last_place.pose, NOWHERE, False, why)
 
     def suggest(self, hint: PoseHint) -> None:
         """See RobotMap."""
         self._hint = hint
 
-    def _here(self) -> Floats | None:
-        """Return the robot's pose as far as odometry knows it."""
+    def _pose_by_odometry(self) -> Floats | None:
+        """Return the robot's pose (3,) by odometry, if known."""
         if self._finder:
             return self._finder.last
-        return compose(self._slam.pose, self._moved) if self._last.localized else None
+        return compose(self._slam.pose, self._motion) if self._last_place.localized else None
 
     def keep(self) -> None:
-        """Copy the map at the next scan at which nothing is under way beside; see `kept`."""
-        self._wanted = True
+        """Copy the map at the next scan without background work; see `kept`."""
+        self._snapshot_wanted = True
 
     def kept(self) -> MapSnapshot | None:
         """Return the copy of the map before the last scan, once; None if none was made."""
-        still, self._still = self._still, None
-        return still
+        snapshot, self._snapshot = self._snapshot, None
+        return snapshot
 
     def grid(self) -> OccupancyGrid:
         """See RobotMap."""
@@ -241,22 +242,22 @@ class SlamMap:
         return self.still().to_save()
 
     def still(self) -> MapSnapshot:
-        """See RobotMap. Waits for the work beside."""
+        """See RobotMap. Waits for background work."""
         self._settling = False
         if self._finder or not self._slam.keyframes:
-            raise Refused(f"not saved: where the robot is, is not known ({self._last.why})")
+            raise Refused(f"not saved: where the robot is, is not known ({self._last_place.why})")
         self._background.finish()
-        return self._copied()
+        return self._copy()
 
-    def _copied(self) -> MapSnapshot:
+    def _copy(self) -> MapSnapshot:
         return MapSnapshot(
-            pose=self._here(),
+            pose=self._pose_by_odometry(),
             lost=self._finder is not None,
             slam=self._slam.still(),
             sweeps=self._sweeps.still(),
             grid=self._grid.still(),
             drawn=[*self._drawn, *self._slam.poses_from(len(self._drawn))],
-            waiting=list(self._waiting),
+            waiting=list(self._undrawn_sweeps),
         )
 
     def report(self) -> dict[str, int]:
@@ -282,79 +283,81 @@ class SlamMap:
         """See RobotMap."""
         self._background.close()
 
-    def _find(
+    def _search_robot(
         self, finder: BackgroundLocalizer, view: View, motion: Floats, noise: Floats
     ) -> Place:
         place = finder.step(view, motion, noise)
         if place.localized:
             self._slam.relocate(place.pose)
-            self._finder, self._doubt = None, KidnapDetector()
-            self._moved, self._doubted = IDENTITY, False
+            self._finder, self._kidnap_detector = None, KidnapDetector()
+            self._motion, self._kidnap_suspected = IDENTITY, False
         return place
 
-    def _look_elsewhere(self, view: View, hint: PoseHint, moved: Floats) -> None:
-        """Lose the robot if the scan fits where a hint says, and better than where it is."""
-        self._unasked += 1
-        if not self._slam.keyframes or self._unasked < LOOKED_SCANS:
+    def _check_hint(self, view: View, hint: PoseHint, moved: Floats) -> None:
+        """Lose the robot if the scan fits better at the hint than at the robot's pose."""
+        self._scans_since_hint += 1
+        if not self._slam.keyframes or self._scans_since_hint < HINT_INTERVAL_SCANS:
             return
-        here = compose(self._slam.pose, moved)
-        if not far_from(hint, here):
+        pose = compose(self._slam.pose, moved)
+        if not far_from(hint, pose):
             return
-        self._unasked = 0
+        self._scans_since_hint = 0
         field = field_of(self._grid.percent(), CELL, (self._grid.origin_x, self._grid.origin_y))
-        if better(field, view.beams, hint, here):
+        if better(field, view.beams, hint, pose):
             self.lose(ELSEWHERE)
 
-    def _doubtful(self, view: View) -> bool:
-        """Leave out a scan that does not belong here; after some of them, the robot is lost."""
+    def _contradicts_map(self, view: View) -> bool:
+        """Return whether a scan contradicts the map; after some of them, lose the robot."""
         if not self._slam.keyframes:
             return False
-        pose = compose(self._slam.pose, self._moved)
-        if not self._doubt.look(self._grid, view, pose):
+        pose = compose(self._slam.pose, self._motion)
+        if not self._kidnap_detector.look(self._grid, view, pose):
             return False
-        if self._doubt.certain:
+        if self._kidnap_detector.certain:
             self.lose("what is seen is not where the robot was thought to be")
         else:
-            self._last = Place(pose, self._last.covariance, True)
+            self._last_place = Place(pose, self._last_place.covariance, True)
         return True
 
-    def _take(self, view: View, estimate: Estimate) -> None:
+    def _draw_if_due(self, view: View, estimate: Estimate) -> None:
         """Draw the scan if it is due and fits."""
         if len(self._drawn) < len(self._slam.keyframes):
             self._drawn += self._slam.poses_from(len(self._drawn))
-        self._undrawn += 1
-        if estimate.kind not in FITS or (self._undrawn < DRAWN_SCANS and not estimate.kept):
+        self._scans_since_drawn += 1
+        if estimate.kind not in FITTING_KINDS or (
+            self._scans_since_drawn < DRAW_INTERVAL_SCANS and not estimate.kept
+        ):
             return
-        self._undrawn = 0
+        self._scans_since_drawn = 0
         sweep = self._sweeps.add(view, estimate.keyframe, estimate.relative, estimate.pose)
-        if self._waiting:
-            self._waiting.append(sweep)
+        if self._undrawn_sweeps:
+            self._undrawn_sweeps.append(sweep)
         else:
             sweep.draw(self._grid, self._drawn[sweep.keyframe])
 
     def _draw_waiting(self) -> None:
-        for sweep in self._waiting[:DRAWN_AT_ONCE]:
+        for sweep in self._undrawn_sweeps[:MAX_SWEEPS_PER_SCAN]:
             sweep.draw(self._grid, self._drawn[sweep.keyframe])
-        del self._waiting[:DRAWN_AT_ONCE]
+        del self._undrawn_sweeps[:MAX_SWEEPS_PER_SCAN]
 
     def _close_loops(self, count: int) -> None:
-        """Beside the scans: look for loops from so many keyframes, and draw what they correct."""
+        """Search for loops from `count` keyframes in the background, and redraw a corrected map."""
         slam, sweeps, drawn = self._slam, self._sweeps.all(), list(self._drawn)
 
         def work() -> Take:
             found = [slam.close_loops() for _ in range(count)]
             corrections = [one for one in found if one]
             grid = None
-            if corrections and _shifted(np.array(drawn), corrections[-1].poses):
+            if corrections and _has_shifted(np.array(drawn), corrections[-1].poses):
                 poses = corrections[-1].poses
-                there = [one for one in sweeps if one.keyframe < len(poses)]
-                grid = _rendered(there, poses)
-            return lambda: self._correct(corrections, grid, sweeps)
+                corrected = [one for one in sweeps if one.keyframe < len(poses)]
+                grid = _drawn_grid(corrected, poses)
+            return lambda: self._apply_corrections(corrections, grid, sweeps)
 
-        scans = LOOP_SCANS + KEYFRAME_SCANS * count + len(sweeps) // SWEEPS_A_SCAN
+        scans = LOOP_SCANS + KEYFRAME_SCANS * count + len(sweeps) // SWEEPS_PER_SCAN
         self._background.start(work, scans)
 
-    def _correct(
+    def _apply_corrections(
         self, corrections: list[Correction], grid: LogOddsGrid | None, drawn: list[GridScan]
     ) -> None:
         for correction in corrections:
@@ -364,27 +367,27 @@ class SlamMap:
             self._renewals += 1
             self._grid, self._drawn = grid, list(self._slam.poses)
             done = {id(one) for one in drawn if one.keyframe < len(corrections[-1].poses)}
-            self._waiting = [one for one in self._sweeps.all() if id(one) not in done]
+            self._undrawn_sweeps = [one for one in self._sweeps.all() if id(one) not in done]
             if self._finder:
-                self.lose(self._last.why)
+                self.lose(self._last_place.why)
 
 
-def _rendered(sweeps: Sequence[GridScan], poses: Sequence[Floats] | Floats) -> LogOddsGrid:
+def _drawn_grid(sweeps: Sequence[GridScan], poses: Sequence[Floats] | Floats) -> LogOddsGrid:
     grid = LogOddsGrid()
     for sweep in sweeps:
         sweep.draw(grid, poses[sweep.keyframe])
     return grid
 
 
-def _shifted(before: Floats, after: Floats) -> bool:
+def _has_shifted(before: Floats, after: Floats) -> bool:
     count = min(len(before), len(after))
-    off = after[:count] - before[:count]
-    far = np.hypot(off[:, 0], off[:, 1]) > SHIFT_M
-    return bool((far | (np.abs(wrap(off[:, 2])) > SHIFT_RAD)).any())
+    offsets = after[:count] - before[:count]
+    moved = np.hypot(offsets[:, 0], offsets[:, 1]) > SHIFT_M
+    return bool((moved | (np.abs(wrap(offsets[:, 2])) > SHIFT_RAD)).any())
 
 
 def warm_up() -> None:
-    """Call every kernel of making a map once."""
+    """Compile the kernels that make a map, by calling each once."""
     warm_up_localizing()
     along = np.linspace(-3.0, 3.0, 60)
     walls = np.concatenate([np.c_[along, along * 0 + 3.0], np.c_[along * 0 + 3.0, along]])

@@ -20,9 +20,9 @@ from gigabrain_zenoh.mapping.occupancy_grid import warm_up as warm_up_grid
 from gigabrain_zenoh.mapping.pose_hint import PoseHint
 
 if TYPE_CHECKING:
-    from gigabrain_zenoh.mapping.slam_map import MapSnapshot  # and gtsam: only who makes maps pays
+    from gigabrain_zenoh.mapping.slam_map import MapSnapshot  # imports gtsam: for slam only
 
-BEAMS, ROOM_M = 60, 1.0
+BEAMS, ROOM_M = 60, 1.0  # of warm_up; half a side
 NO_POSES: Floats = np.empty((0, 3))
 
 
@@ -47,8 +47,8 @@ class RobotMap(Protocol):
     def keyframes(self) -> tuple[int, Floats]:
         """Return the poses of the keyframes as they are in the grid (n, 3), and their version.
 
-        The version changes when poses do, not when there are more. A map that never changes has
-        none.
+        The version changes when poses are corrected, not when some are added. A map that never
+        changes has no keyframes.
         """
         return 0, NO_POSES
 
@@ -71,7 +71,7 @@ class RobotMap(Protocol):
         """Return counters for health reports."""
 
     def problems(self) -> tuple[Cause, ...]:
-        """Return the present limitations."""
+        """Return the present problems of the map."""
         return ()
 
     def close(self) -> None:
@@ -129,14 +129,14 @@ class StaticMap(RobotMap):
 
 
 def warm_up() -> None:
-    """Call every kernel of finding the way in a map once, in a room of 2 x 2 m."""
+    """Compile the kernels that localize, by calling each once in a room of 2 x 2 m."""
     angles = np.linspace(0.0, 2 * np.pi, BEAMS, endpoint=False)
-    ways = np.column_stack((np.cos(angles), np.sin(angles)))
-    scan = Scan.of(ROOM_M * ways / np.abs(ways).max(axis=1, keepdims=True), ways[:1])
+    rays = np.column_stack((np.cos(angles), np.sin(angles)))
+    scan = Scan.of(ROOM_M * rays / np.abs(rays).max(axis=1, keepdims=True), rays[:1])
     warm_up_grid()
-    drawn = LogOddsGrid()
-    drawn.draw(IDENTITY, scan.points, scan.free)
-    field = field_of(drawn.percent(), CELL, (drawn.origin_x, drawn.origin_y))
+    grid = LogOddsGrid()
+    grid.draw(IDENTITY, scan.points, scan.free)
+    field = field_of(grid.percent(), CELL, (grid.origin_x, grid.origin_y))
     beams = View(scan, np.zeros(2)).beams
     search(field, beams)
     contradiction(field, beams, np.zeros(3))

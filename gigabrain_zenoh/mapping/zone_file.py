@@ -39,7 +39,7 @@ def path_beside(map_path: Path) -> Path:
 
 
 def load(map_path: Path) -> ZoneFile:
-    """Load the zones beside a map's YAML file; none without such a file. Raises ConfigError."""
+    """Load the zones beside a map's YAML file, if there are any. Raises ConfigError."""
     path = path_beside(map_path)
     if not path.exists():
         return ZoneFile()
@@ -61,7 +61,7 @@ def save(map_path: Path, zones: ZoneFile) -> None:
 
 
 def encoded(zones: ZoneFile) -> bytes:
-    """Return the content of a file. Raises Refused if it could not be read again."""
+    """Return the content of a file. Raises Refused if it would be too large to load."""
     data = "".join((HEAD, f"version: {VERSION}\n", *_lines(zones))).encode()
     if len(data) > loading.MAX_BYTES:
         raise Refused(f"not saved: {len(data)} bytes of zones; at most {loading.MAX_BYTES} do")
@@ -69,7 +69,7 @@ def encoded(zones: ZoneFile) -> bytes:
 
 
 def zone_problem(zone: Zone) -> str:
-    """Return why a zone makes no sense, and what to do, or an empty text."""
+    """Return the fault of a zone and its remedy, or an empty text."""
     corners = np.array(zone.points)
     if zone.kind == "one_way":
         steps = np.hypot(*np.diff(corners, axis=0).T)
@@ -79,9 +79,9 @@ def zone_problem(zone: Zone) -> str:
 
 
 def new_zone_problem(zone: Zone) -> str:
-    """Return why a zone is refused: it must make sense as written, and to 1 mm as well.
+    """Return the fault of a new zone, which must be valid as written and rounded to 1 mm.
 
-    So its file can be read also after a loop closure has moved and turned the zone.
+    So its file can still be read after a loop closure moves and turns the zone.
     """
     return zone_problem(_rounded(zone, DECIMALS)) or zone_problem(_rounded(zone, 3))
 
