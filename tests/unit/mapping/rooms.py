@@ -1,4 +1,4 @@
-"""Rooms made of walls, and what a lidar sees in them."""
+"""Rooms made of walls, and a lidar in them."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,25 +11,25 @@ Walls = Floats  # (n, 4): x and y of both ends [m]
 
 
 def box(x: float, y: float, width: float, height: float) -> list[tuple[float, ...]]:
-    """The four walls of a rectangle with this lower left corner."""
+    """Return the four walls of a rectangle with lower left corner (x, y)."""
     right, top = x + width, y + height
     return [(x, y, right, y), (right, y, right, top), (right, top, x, top), (x, top, x, y)]
 
 
 def ranges(walls: Walls, pose: Floats, angles: Floats) -> Floats:
-    """The distance to the nearest wall along each beam; inf where there is none."""
-    ways = np.column_stack((np.cos(angles + pose[2]), np.sin(angles + pose[2])))
-    start, along = walls[:, :2] - pose[:2], walls[:, 2:] - walls[:, :2]
-    facing = ways[:, :1] * along[:, 1] - ways[:, 1:] * along[:, 0]  # (beams, walls)
+    """Return the distance to the nearest wall along each beam (n,) [m]; inf where there is none."""
+    rays = np.column_stack((np.cos(angles + pose[2]), np.sin(angles + pose[2])))
+    start, edges = walls[:, :2] - pose[:2], walls[:, 2:] - walls[:, :2]
+    determinant = rays[:, :1] * edges[:, 1] - rays[:, 1:] * edges[:, 0]  # (beams, walls)
     with np.errstate(divide="ignore", invalid="ignore"):
-        away = (start[:, 0] * along[:, 1] - start[:, 1] * along[:, 0]) / facing
-        share = (start[:, 0] * ways[:, 1:] - start[:, 1] * ways[:, :1]) / facing
-    hit = (away > 0) & (share >= 0) & (share <= 1)
-    return np.where(hit, away, np.inf).min(axis=1)
+        distances = (start[:, 0] * edges[:, 1] - start[:, 1] * edges[:, 0]) / determinant
+        share = (start[:, 0] * rays[:, 1:] - start[:, 1] * rays[:, :1]) / determinant
+    hit = (distances > 0) & (share >= 0) & (share <= 1)
+    return np.where(hit, distances, np.inf).min(axis=1)
 
 
 class Lidar:
-    """All-round beams with noise, the same for the same seed."""
+    """A lidar of 360 degrees with noise, reproducible by its seed."""
 
     def __init__(self, beams: int, reach: float = 10.0, noise: float = 0.01, seed: int = 1) -> None:
         self.angles: Floats = np.arange(beams) * 2 * np.pi / beams
@@ -38,22 +38,22 @@ class Lidar:
         self.random = np.random.default_rng(seed)
 
     def scan(self, walls: Walls, pose: Floats) -> Scan:
-        seen = ranges(walls, pose, self.angles)
-        noisy = seen + self.random.normal(0, self.noise, len(seen))
+        true_ranges = ranges(walls, pose, self.angles)
+        noisy = true_ranges + self.random.normal(0, self.noise, len(true_ranges))
         return from_beams(self.angles, noisy, 0.1, self.reach, free_range=self.reach)
 
 
 def drifting(poses: Floats, turn: float, scale: float) -> Floats:
-    """The steps (n, 3) between `poses`, as odometry would tell them that turns and stretches."""
+    """Return the steps (n, 3) between `poses` by odometry with errors `turn` and `scale`."""
     from gigabrain_zenoh.geometry.se2 import between
 
     steps = between(poses[:-1], poses[1:])
-    away = np.hypot(steps[:, 0], steps[:, 1])
-    return steps * (scale, scale, 1.0) + np.outer(away, (0.0, 0.0, turn))
+    distances = np.hypot(steps[:, 0], steps[:, 1])
+    return steps * (scale, scale, 1.0) + np.outer(distances, (0.0, 0.0, turn))
 
 
 def line(start: Floats, end: Floats, step: float) -> Floats:
-    """Poses from `start` to `end`, both with the yaw of the first, `step` [m] apart."""
+    """Return poses from `start` to `end`, `step` [m] apart, with the yaw of `start`."""
     count = int(np.hypot(*(end - start)[:2]) / step) + 1
     share = np.linspace(0, 1, count)[:, None]
     return start * (1 - share) + np.array((end[0], end[1], start[2])) * share

@@ -1,4 +1,4 @@
-"""gtsam raises, once or each time: poses stay right, and mapping goes on."""
+"""gtsam raises, once or always: poses stay right, and mapping continues."""
 
 import math
 from collections.abc import Callable
@@ -16,15 +16,15 @@ from gigabrain_zenoh.mapping.pose_graph import Graph
 from gigabrain_zenoh.mapping.slam_map import SlamMap
 from tests.unit.mapping.houses import HOUSE, PATIENCE_S, Rooms, at, error, grown
 
-SURE = np.diag((0.05, 0.05, 0.01)) ** 2
+COVARIANCE = np.diag((0.05, 0.05, 0.01)) ** 2
 SIDE = 10  # keyframes along each side of a square of 1 m steps
 LOOP, LATER = 40, 43  # keyframes that see the first ones again
 
-Plan = Callable[[int, str], bool]  # whether to raise, by the number of the call and the solver
+Plan = Callable[[int, str], bool]  # return whether to raise, from the call's number and the solver
 
 
-class Failing:
-    """An optimiser that raises as gtsam does, by plan."""
+class FailingOptimiser:
+    """An optimiser that raises like gtsam, by plan."""
 
     def __init__(self, real: gtsam.ISAM2, solver: str, plan: Plan, calls: list[int]) -> None:
         self._real, self._solver, self._plan, self._calls = real, solver, plan, calls
@@ -45,17 +45,19 @@ def fail(monkeypatch: pytest.MonkeyPatch) -> Callable[[Plan], None]:
 
     def planned(plan: Plan) -> None:
         calls = [0]
-        monkeypatch.setattr(pose_graph, "_optimiser", lambda s: Failing(real(s), s, plan, calls))
+        monkeypatch.setattr(
+            pose_graph, "_optimiser", lambda s: FailingOptimiser(real(s), s, plan, calls)
+        )
 
     return planned
 
 
 def edge(first: int, second: int, relative: Floats) -> Edge:
-    return Edge(first, second, relative, SURE, doubtful=False)
+    return Edge(first, second, relative, COVARIANCE, doubtful=False)
 
 
-def links() -> list[Edge]:
-    """Round a square and a bit farther, each step turned 0.5 degrees too far."""
+def square_links() -> list[Edge]:
+    """Return links round a square and on; each turns 0.5 degrees too far."""
     step = np.array((1.0, 0.0, math.radians(0.5)))
     corner = np.array((1.0, 0.0, math.radians(90.5)))
     steps = [corner if k % SIDE == 0 else step for k in range(1, LATER + 1)]
@@ -74,19 +76,19 @@ def loop(first: int, second: int) -> Edge:
     return edge(first, second, between(true_pose(first), true_pose(second)))
 
 
-def driven() -> Graph:
-    """All keyframes one by one, and a loop as soon as each can be closed."""
-    whole = Graph()
-    for link in links():
-        whole.extend([link])
+def build_graph() -> Graph:
+    """Add all keyframes one by one, and close each loop at once."""
+    graph = Graph()
+    for link in square_links():
+        graph.extend([link])
         if link.second in (LOOP, LATER):
-            done = whole.close([loop(link.second - LOOP, link.second)])
-            while not done:
-                done = whole.settle()
-    return whole
+            settled = graph.close([loop(link.second - LOOP, link.second)])
+            while not settled:
+                settled = graph.settle()
+    return graph
 
 
-def off(found: Graph, other: Graph) -> float:
+def max_difference(found: Graph, other: Graph) -> float:
     return float(np.abs(found.poses - other.poses).max())
 
 
@@ -95,65 +97,65 @@ def test_an_optimiser_that_raises_once_is_rebuilt_and_no_loop_is_lost(
     call: int, fail: Callable[[Plan], None], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(pose_graph, "MAX_POSES_AT_ONCE", 10)  # loops settle in several pieces
-    undisturbed = driven()
+    undisturbed = build_graph()
     fail(lambda number, _: number == call)
-    found = driven()
+    found = build_graph()
     assert found.rebuilt == 1
     assert found.failure == ""
     assert len(found.loops) == 2
-    assert off(found, undisturbed) < 0.01
+    assert max_difference(found, undisturbed) < 0.01
 
 
-def test_what_one_solver_cannot_do_at_all_the_other_does(fail: Callable[[Plan], None]) -> None:
-    undisturbed = driven()
+def test_qr_replaces_cholesky_where_that_fails(fail: Callable[[Plan], None]) -> None:
+    undisturbed = build_graph()
     fail(lambda number, solver: solver == "CHOLESKY" and number >= 20)
-    found = driven()
+    found = build_graph()
     assert (found.rebuilt, found.failure) == (1, "")
-    assert off(found, undisturbed) < 0.01
+    assert max_difference(found, undisturbed) < 0.01
 
 
-def test_a_loop_that_no_solver_takes_is_left_out_and_the_next_one_closes() -> None:
+def test_a_loop_that_no_solver_accepts_is_left_out_and_the_next_one_closes() -> None:
     found = Graph()
-    found.extend(links())
+    found.extend(square_links())
     before = found.poses.copy()
     assert found.close([edge(0, LOOP, np.array((math.nan, 0.0, 0.0)))])
     assert found.rebuilt == 1
     assert found.loops == []
     assert found.failure == ""
     assert np.abs(found.poses - before).max() < 1e-6
-    done = found.close([loop(0, LOOP)])
-    while not done:
-        done = found.settle()
+    settled = found.close([loop(0, LOOP)])
+    while not settled:
+        settled = found.settle()
     assert len(found.loops) == 1
     assert np.abs(found.poses[LOOP] - true_pose(LOOP))[:2].max() < 0.05
 
 
 @pytest.mark.parametrize("since", [1, 21, 42, 44])
-def test_where_every_solver_raises_keyframes_still_come_and_poses_stay(
+def test_if_every_solver_raises_keyframes_are_added_and_poses_stay(
     since: int, fail: Callable[[Plan], None]
 ) -> None:
     fail(lambda number, _: number >= since)
-    found = driven()
+    found = build_graph()
     assert found.failure == "Indeterminate linear system detected near variable 7."
     assert found.rebuilt == 1
     assert len(found.poses) == LATER + 1
     assert np.isfinite(found.poses).all()
-    led = links()[LATER].relative
+    led = square_links()[LATER].relative
     assert np.abs(between(found.poses[LATER - 1], found.poses[LATER]) - led).max() < 0.02
 
 
 @pytest.mark.parametrize("since", [1, 2])
-def test_poses_that_rest_on_known_loops_stay_where_no_solver_takes_them(
+def test_poses_with_known_loops_stay_if_every_solver_raises(
     since: int, fail: Callable[[Plan], None]
 ) -> None:
-    closed = driven()
+    closed = build_graph()
     fail(lambda number, _: number >= since)
     found = Graph()
-    found.extend(links(), closed.poses)
+    found.extend(square_links(), closed.poses)
     assert found.close(closed.loops, known=True)
     assert found.failure
     assert len(found.loops) == 2
-    assert off(found, closed) == 0.0
+    assert max_difference(found, closed) == 0.0
 
 
 # round the house, twice
@@ -165,7 +167,7 @@ TOUR = (
 
 @pytest.mark.long
 @pytest.mark.parametrize("keyframe", [5, 45])
-def test_a_map_grows_on_after_its_optimiser_raised_at_a_keyframe(
+def test_a_map_still_grows_after_its_optimiser_raised_at_a_keyframe(
     keyframe: int, fail: Callable[[Plan], None]
 ) -> None:
     fail(lambda number, _: number == keyframe)
@@ -179,7 +181,7 @@ def test_a_map_grows_on_after_its_optimiser_raised_at_a_keyframe(
 
 
 @pytest.mark.long
-def test_a_map_whose_optimiser_always_raises_grows_without_loops_says_so_and_is_kept(
+def test_a_map_whose_optimiser_always_raises_grows_without_loops_and_reports_it(
     fail: Callable[[Plan], None],
 ) -> None:
     fail(lambda number, _: number >= 45)

@@ -1,4 +1,4 @@
-"""The occupancy grid: ways are free, ends are not, and what has gone does not stay."""
+"""Occupancy grid: beams free their paths and fill their ends, and old obstacles disappear."""
 
 import numpy as np
 import pytest
@@ -10,7 +10,7 @@ from gigabrain_zenoh.mapping.occupancy_grid import LogOddsGrid
 from gigabrain_zenoh.mapping.slam_map import SlamMap
 from tests.unit.mapping.houses import HOUSE, Rooms, at
 
-NONE = np.empty((0, 2), np.float32)
+NO_POINTS = np.empty((0, 2), np.float32)
 
 
 def points(*pairs: tuple[float, float]) -> NDArray[np.float32]:
@@ -22,85 +22,85 @@ def percent(grid: LogOddsGrid, x: float, y: float) -> int:
     return int(grid.percent()[row, column])
 
 
-def test_a_beam_frees_its_way_and_fills_its_end() -> None:
+def test_a_beam_frees_its_path_and_fills_its_end() -> None:
     grid = LogOddsGrid()
-    grid.draw(at(0.025, 0.025), points((1.0, 0.0)), NONE)
+    grid.draw(at(0.025, 0.025), points((1.0, 0.0)), NO_POINTS)
     assert percent(grid, 1.025, 0.025) == 71
     assert [percent(grid, x, 0.025) for x in (0.025, 0.5, 0.976)] == [38, 38, 38]
     assert percent(grid, 1.1, 0.025) == percent(grid, 0.5, 0.1) == -1
 
 
-def test_a_beam_that_hit_nothing_frees_its_way_and_fills_nothing() -> None:
+def test_a_beam_that_hit_nothing_frees_its_path_and_fills_nothing() -> None:
     grid = LogOddsGrid()
-    grid.draw(at(0.025, 0.025), NONE, points((0.0, 2.0)))
+    grid.draw(at(0.025, 0.025), NO_POINTS, points((0.0, 2.0)))
     assert percent(grid, 0.025, 1.976) == 38
     assert grid.percent().max() == 38
 
 
-def test_in_one_scan_a_hit_goes_before_beams_that_pass_and_counts_once() -> None:
+def test_in_one_scan_a_hit_overrides_passing_beams_and_counts_once() -> None:
     grid = LogOddsGrid()
-    grid.draw(at(0.025, 0.025), points((1.0, 0.0), (1.0, 0.001), (2.0, 0.0)), NONE)
+    grid.draw(at(0.025, 0.025), points((1.0, 0.0), (1.0, 0.001), (2.0, 0.0)), NO_POINTS)
     assert percent(grid, 1.025, 0.025) == 71
     assert percent(grid, 1.5, 0.025) == 38
 
 
 def test_a_turned_sensor_draws_where_it_looks() -> None:
     grid = LogOddsGrid()
-    grid.draw(at(1.025, 2.025, 90), points((1.0, 0.0)), NONE)
+    grid.draw(at(1.025, 2.025, 90), points((1.0, 0.0)), NO_POINTS)
     assert percent(grid, 1.025, 3.025) == 71
 
 
-def test_it_grows_to_all_sides_and_keeps_what_was_drawn() -> None:
+def test_a_grid_grows_to_all_sides_and_keeps_its_cells() -> None:
     grid = LogOddsGrid()
-    grid.draw(at(0.025, 0.025), points((1.0, 0.0)), NONE)
+    grid.draw(at(0.025, 0.025), points((1.0, 0.0)), NO_POINTS)
     before = grid.log_odds.shape
     for end in ((-9.0, 0.0), (9.0, 0.0), (0.0, -9.0), (0.0, 9.0)):
-        grid.draw(at(0.025, 0.025), points(end), NONE)
+        grid.draw(at(0.025, 0.025), points(end), NO_POINTS)
     assert percent(grid, -8.975, 0.025) == percent(grid, 0.025, 9.025) == 71
     assert percent(grid, 1.025, 0.025) == 60  # hit once, passed once
     assert all(now > then for now, then in zip(grid.log_odds.shape, before, strict=True))
     assert all(side % 64 == 0 for side in grid.log_odds.shape)
 
 
-def test_what_would_not_fit_into_a_message_is_left_out_and_reported() -> None:
+def test_cells_that_do_not_fit_into_a_message_are_left_out_and_reported() -> None:
     grid = LogOddsGrid()
-    grid.draw(at(0, 0), points((1.0, 0.0)), NONE)
+    grid.draw(at(0, 0), points((1.0, 0.0)), NO_POINTS)
     assert not grid.full
-    grid.draw(at(0, 0), points((200.0, 0.0)), NONE)
+    grid.draw(at(0, 0), points((200.0, 0.0)), NO_POINTS)
     assert grid.full
     assert grid.log_odds.shape == (64, 2800)
     assert percent(grid, 139.0, 0.0) == 38
 
 
-def test_a_room_longer_than_the_limit_is_drawn_as_far_as_it_goes_round_the_robot() -> None:
+def test_a_room_longer_than_the_limit_is_drawn_round_the_robot() -> None:
     grid = LogOddsGrid()
     for _ in range(2):
-        grid.draw(at(0, 0), points((80.0, 0.0), (-90.0, 0.0), (0.0, 3.0)), NONE)
+        grid.draw(at(0, 0), points((80.0, 0.0), (-90.0, 0.0), (0.0, 3.0)), NO_POINTS)
     assert grid.full
     assert grid.log_odds.shape == (64, 2800)
     assert grid.origin_x == pytest.approx(-70.0)
     assert percent(grid, 0.025, 3.025) > 70 > 30 > percent(grid, -69.9, -0.025)
 
 
-def test_near_the_limit_a_beam_that_is_too_far_does_not_keep_the_grid_from_growing() -> None:
+def test_near_the_limit_the_grid_still_grows_despite_a_beam_that_is_too_long() -> None:
     grid = LogOddsGrid()
-    grid.draw(at(0, 0), points((130.0, 0.0)), NONE)
-    grid.draw(at(125, 0), points((-200.0, 0.0), (6.0, 0.0), (0.0, 5.0)), NONE)
+    grid.draw(at(0, 0), points((130.0, 0.0)), NO_POINTS)
+    grid.draw(at(125, 0), points((-200.0, 0.0), (6.0, 0.0), (0.0, 5.0)), NO_POINTS)
     assert grid.log_odds.shape == (128, 2800)
     assert percent(grid, 131.025, 0.025) == percent(grid, 125.025, 5.025) == 71
     assert percent(grid, 129.0, 0.025) < 50
 
 
-def test_what_fits_exactly_is_drawn_and_not_reported() -> None:
+def test_cells_that_fit_exactly_are_drawn_and_not_reported() -> None:
     grid = LogOddsGrid()
-    grid.draw(at(0.025, 0.025), points((139.95, 0.0)), NONE)
+    grid.draw(at(0.025, 0.025), points((139.95, 0.0)), NO_POINTS)
     assert not grid.full
     assert percent(grid, 139.975, 0.025) == 71
 
 
-def test_what_walked_by_leaves_no_trace_and_walls_stay() -> None:
+def test_a_passing_person_leaves_no_trace_and_walls_stay() -> None:
     rooms, grid = Rooms(HOUSE), LogOddsGrid()
-    for step in range(60):  # somebody crosses the room, 0.4 m wide
+    for step in range(60):  # a person, 0.4 m wide, crosses the room
         x = 1.0 + 0.04 * step
         person = [(x, 3.2, x, 3.6), (x - 0.2, 3.4, x + 0.2, 3.4)]
         scan = rooms.view(at(2.0, 2.5), person).scan
@@ -109,22 +109,22 @@ def test_what_walked_by_leaves_no_trace_and_walls_stay() -> None:
     assert max(percent(grid, x, 2.5) for x in (-0.03, 0.02)) > 90
 
 
-def test_what_stood_there_for_long_is_gone_after_eight_scans_without_it() -> None:
+def test_an_obstacle_disappears_after_eight_scans_without_it() -> None:
     grid = LogOddsGrid()
     for _ in range(100):
-        grid.draw(at(0.025, 0.025), points((1.0, 0.0)), NONE)
+        grid.draw(at(0.025, 0.025), points((1.0, 0.0)), NO_POINTS)
     assert percent(grid, 1.025, 0.025) == 97
     history = []
     for _ in range(8):
-        grid.draw(at(0.025, 0.025), points((2.0, 0.0)), NONE)
+        grid.draw(at(0.025, 0.025), points((2.0, 0.0)), NO_POINTS)
         history.append(percent(grid, 1.025, 0.025))
     assert history[5] >= 60
     assert history[-1] < 40
 
 
-def test_its_message_says_where_it_is() -> None:
+def test_a_message_holds_the_origin_of_the_grid() -> None:
     grid = LogOddsGrid()
-    grid.draw(at(-2.025, 1.025), points((1.0, 0.0)), NONE)
+    grid.draw(at(-2.025, 1.025), points((1.0, 0.0)), NO_POINTS)
     message = grid.message()
     assert (message.resolution, message.width, message.height) == (0.05, 64, 64)
     assert message.origin_x == pytest.approx(-2.05)
@@ -132,19 +132,19 @@ def test_its_message_says_where_it_is() -> None:
     assert message.cells.count(b"\xff") == 64 * 64 - 21
 
 
-def test_a_grid_as_it_was_saved_goes_on() -> None:
+def test_a_restored_grid_continues_like_the_original() -> None:
     first = LogOddsGrid()
-    first.draw(at(0.025, 0.025), points((1.0, 0.0)), NONE)
+    first.draw(at(0.025, 0.025), points((1.0, 0.0)), NO_POINTS)
     again = LogOddsGrid.of(first.log_odds, first.known(), (first.origin_x, first.origin_y))
     for grid in (first, again):
-        grid.draw(at(0.025, 0.025), points((1.5, 0.0)), NONE)
+        grid.draw(at(0.025, 0.025), points((1.5, 0.0)), NO_POINTS)
     assert np.array_equal(first.percent(), again.percent())
     assert grids.MAX_CELLS**2 <= 8 * 1024 * 1024
 
 
-def test_a_part_of_it_is_what_the_whole_shows_there() -> None:
+def test_a_part_equals_the_same_part_of_the_whole_grid() -> None:
     grid = LogOddsGrid()
-    grid.draw(at(0.025, 0.025), points((3.0, 0.0), (-3.0, 2.0)), NONE)
+    grid.draw(at(0.025, 0.025), points((3.0, 0.0), (-3.0, 2.0)), NO_POINTS)
     part, (x, y) = grid.around(2.0, 0.5, 1.0)
     column, row = round((x - grid.origin_x) / 0.05), round((y - grid.origin_y) / 0.05)
     assert part.shape == (40, 40)
@@ -152,7 +152,7 @@ def test_a_part_of_it_is_what_the_whole_shows_there() -> None:
     assert grid.around(500.0, 0.0, 1.0)[0].size == 0
 
 
-def test_a_map_with_hits_beyond_the_reach_is_drawn_and_gone_on_with() -> None:
+def test_a_map_with_hits_beyond_the_reach_is_drawn_and_continued() -> None:
     hits = np.vstack((Rooms(HOUSE).view(at(2.0, 2.5)).scan.points, points((250.0, 0.0))))
     grown, view = SlamMap(), View(Scan.of(hits), np.zeros(2))
     for _ in range(6):

@@ -1,4 +1,4 @@
-"""The kidnap detector keeps what it has made of the map, but judges by the map as it is."""
+"""The kidnap detector caches a field of the map, but judges by the present map."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -8,7 +8,7 @@ from gigabrain_zenoh.mapping.localizer import KidnapDetector
 from gigabrain_zenoh.mapping.occupancy_grid import LogOddsGrid
 
 HERE, THERE = np.zeros(3), np.array((20.0, 0.0, 0.0))
-NOTHING = np.empty((0, 2), np.float32)
+NO_POINTS = np.empty((0, 2), np.float32)
 
 
 def wall(x: float) -> NDArray[np.float32]:
@@ -16,7 +16,7 @@ def wall(x: float) -> NDArray[np.float32]:
 
 
 def view(x: float) -> View:
-    """Return what a robot sees that stands `x` [m] before a wall."""
+    """Return the scan of a robot `x` [m] in front of a wall."""
     return View(Scan.of(wall(x)), np.zeros(2))
 
 
@@ -29,7 +29,7 @@ def mapped(*walls: tuple[NDArray[np.float64], float]) -> LogOddsGrid:
 
 def draw(grid: LogOddsGrid, pose: NDArray[np.float64], x: float) -> None:
     for _ in range(8):
-        grid.draw(pose, wall(x), NOTHING)
+        grid.draw(pose, wall(x), NO_POINTS)
 
 
 def test_a_wall_that_was_drawn_since_the_last_look_counts() -> None:
@@ -39,13 +39,13 @@ def test_a_wall_that_was_drawn_since_the_last_look_counts() -> None:
     assert detector.look(grid, view(4.0), HERE)
 
 
-def test_after_a_drive_what_is_round_the_robot_then_counts() -> None:
+def test_after_a_drive_the_map_round_the_new_pose_counts() -> None:
     grid, detector = mapped((HERE, 4.0), (THERE, 2.0)), KidnapDetector()
     assert not detector.look(grid, view(4.0), HERE)
     assert detector.look(grid, view(4.0), THERE)
 
 
-def test_a_map_that_was_drawn_again_counts() -> None:
+def test_a_redrawn_map_counts() -> None:
     detector = KidnapDetector()
     assert not detector.look(mapped((HERE, 4.0)), view(4.0), HERE)
     assert detector.look(mapped((HERE, 2.0)), view(4.0), HERE)

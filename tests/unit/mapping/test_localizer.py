@@ -1,4 +1,4 @@
-"""Localisation in a saved map: found from nothing, followed, lost when carried off, found again."""
+"""Localization in a saved map: global search, tracking, kidnapping, places that look alike."""
 
 import numpy as np
 import pytest
@@ -23,12 +23,14 @@ from tests.unit.mapping.houses import (
 )
 
 CUPBOARD = [(1, 5), (2, 5)]  # in the hall
-WAY = [at(x, y, 10) for x in (1.0, 2.0, 3.0, 5.0, 6.0, 7.0) for y in (1.0, 2.0, 3.0, 4.0, 5.0)]
+VIEWPOINTS = [
+    at(x, y, 10) for x in (1.0, 2.0, 3.0, 5.0, 6.0, 7.0) for y in (1.0, 2.0, 3.0, 4.0, 5.0)
+]
 
 
 @pytest.fixture(scope="module")
 def house() -> SavedMap:
-    return drawn(Rooms(HOUSE), *(pose for pose in WAY if (pose[:2] != (1.0, 5.0)).any()))
+    return drawn(Rooms(HOUSE), *(pose for pose in VIEWPOINTS if (pose[:2] != (1.0, 5.0)).any()))
 
 
 @pytest.fixture(scope="module")
@@ -42,15 +44,15 @@ def walker(saved: SavedMap, walls: list[tuple[float, float, float, float]], x: f
     return Walker(Rooms(walls), StaticMap(saved, PATIENCE_S), at(x, y, degrees))
 
 
-def test_a_scan_is_drawn_to_where_it_belongs(house: SavedMap) -> None:
+def test_a_scan_is_fitted_to_its_place(house: SavedMap) -> None:
     field = field_of(house.cells, house.resolution, (house.origin_x, house.origin_y))
     view = Rooms(HOUSE).view(at(3.0, 2.5, 30))
-    free = np.eye(3) * 1e-3
-    found = fit(field, view.beams, at(3.12, 2.41, 35), free)
+    weak_prior = np.eye(3) * 1e-3
+    found = fit(field, view.beams, at(3.12, 2.41, 35), weak_prior)
     assert found.pose[:2] == pytest.approx((3.0, 2.5), abs=0.02)
     assert np.degrees(found.pose[2]) == pytest.approx(30, abs=0.5)
     assert found.score > 0.9
-    elsewhere = fit(field, view.beams, at(6, 4), free)
+    elsewhere = fit(field, view.beams, at(6, 4), weak_prior)
     assert elsewhere.score < 0.45
 
 
@@ -58,7 +60,7 @@ def test_a_scan_is_drawn_to_where_it_belongs(house: SavedMap) -> None:
 @pytest.mark.parametrize(
     "pose", [at(1.0, 1.0, 77), at(3.3, 5.2, -140), at(5.5, 1.5, 180), at(7.2, 4.4, -12)]
 )
-def test_one_scan_finds_its_place_in_the_whole_house(pose: object, house: SavedMap) -> None:
+def test_one_scan_is_localized_in_the_whole_house(pose: object, house: SavedMap) -> None:
     assert isinstance(pose, np.ndarray)
     field = field_of(house.cells, house.resolution, (house.origin_x, house.origin_y))
     view = Rooms(HOUSE).view(pose)
@@ -67,7 +69,7 @@ def test_one_scan_finds_its_place_in_the_whole_house(pose: object, house: SavedM
     assert np.cos(best.pose[2] - pose[2]) == pytest.approx(1.0, abs=2e-4)  # 1 degree
 
 
-def test_a_scan_of_nothing_and_a_map_of_nothing_give_no_place(house: SavedMap) -> None:
+def test_an_empty_scan_or_map_gives_no_place(house: SavedMap) -> None:
     field = field_of(house.cells, house.resolution, (house.origin_x, house.origin_y))
     view = Rooms([(50, 50, 51, 51)]).view(at(0, 0))
     assert len(view.scan.free) == BEAMS
@@ -78,7 +80,7 @@ def test_a_scan_of_nothing_and_a_map_of_nothing_give_no_place(house: SavedMap) -
 
 
 @pytest.mark.long
-def test_it_is_found_from_nothing_and_followed_to_3_cm(house: SavedMap) -> None:
+def test_a_robot_is_localized_without_a_prior_and_tracked_to_3_cm(house: SavedMap) -> None:
     robot = walker(house, HOUSE, 3.0, 2.0, 45)
     assert not robot.look().localized
     assert robot.look(14).localized
@@ -90,7 +92,9 @@ def test_it_is_found_from_nothing_and_followed_to_3_cm(house: SavedMap) -> None:
 
 
 @pytest.mark.long
-def test_carried_off_it_is_lost_within_5_scans_and_found_again(house: SavedMap) -> None:
+def test_a_robot_that_is_carried_off_is_lost_within_5_scans_and_found_again(
+    house: SavedMap,
+) -> None:
     robot = walker(house, HOUSE, 3.0, 2.0)
     assert robot.look(15).localized
     robot.pose = at(6.5, 4.8, 120)
@@ -103,32 +107,32 @@ def test_carried_off_it_is_lost_within_5_scans_and_found_again(house: SavedMap) 
 
 
 @pytest.mark.long
-def test_while_two_places_look_alike_neither_is_believed(corridor: SavedMap) -> None:
+def test_a_robot_is_not_localized_while_two_places_look_alike(corridor: SavedMap) -> None:
     walls = [*CORRIDOR, *NICHE]
     robot = walker(corridor, walls, 1.5, 0.7)
     place = robot.look(30)
     assert not place.localized
     assert place.why == "it could be in 2 places"
-    assert not robot.go((2.5, 0.7)).localized  # not from there either
+    assert not robot.go((2.5, 0.7)).localized  # nor from there
     place = robot.go((7.5, 0.8))
     assert place.localized
     assert error(place, robot.pose) < 0.05
 
 
 def hall(reach: int) -> SavedMap:
-    """The hall from the left, as seen from places up to `reach` [m]: the right end is not shown."""
+    """Return the map of the hall, seen from x up to `reach` [m]; the right end is unknown."""
     places = [(x, y) for x in range(1, reach + 1) for y in (1, 3, 5) if (x, y) not in CUPBOARD]
     return drawn(Rooms(HALL), *(at(x, y) for x, y in places))
 
 
-def ends(found: list[Candidate]) -> list[float]:
-    """Return the places along the hall [m], rounded to 10 cm."""
+def x_positions(found: list[Candidate]) -> list[float]:
+    """Return the x of the candidates [m], rounded to 10 cm."""
     return [round(float(one.pose[0]), 1) for one in found]
 
 
 @pytest.mark.long
 @pytest.mark.parametrize("x", [11.0, 11.5])
-def test_a_place_that_is_mapped_whole_is_not_taken_for_one_that_is_mapped_half(x: float) -> None:
+def test_a_fully_mapped_place_is_not_preferred_to_a_half_mapped_one(x: float) -> None:
     robot = walker(hall(9), HALL, x, 3.0)
     place = robot.look(16)
     assert not place.localized
@@ -136,10 +140,10 @@ def test_a_place_that_is_mapped_whole_is_not_taken_for_one_that_is_mapped_half(x
 
 
 @pytest.mark.long
-@pytest.mark.parametrize(  # m of the hall that are mapped
+@pytest.mark.parametrize(  # [m], mapped part of the hall
     "reach", [9, pytest.param(15, marks=pytest.mark.qa)]
 )
-def test_in_a_hall_that_is_the_same_from_both_ends_neither_is_believed(reach: int) -> None:
+def test_in_a_symmetric_hall_a_robot_is_not_localized_wrongly(reach: int) -> None:
     saved, rooms = hall(reach), Rooms(HALL)
     for k, x in enumerate((4.8, 6.5, 8.0, 9.2, 10.5, 11.0, 11.4, 11.8)):
         robot = Walker(rooms, StaticMap(saved, PATIENCE_S), at(x, 2.8, 50 * k))
@@ -149,27 +153,30 @@ def test_in_a_hall_that_is_the_same_from_both_ends_neither_is_believed(reach: in
         assert places[-1].localized or places[-1].why.startswith("it could be in ")
 
 
-def test_a_hall_goes_on_as_itself_turned_about() -> None:
+def test_a_symmetric_hall_is_similar_to_itself_turned_by_180_degrees() -> None:
     half = hall(9)
     field = field_of(half.cells, half.resolution, (half.origin_x, half.origin_y))
     assert is_self_similar(field, at(16.0, 6.0, 180))
     assert not is_self_similar(field, at(15.0, 6.0, 180))
-    assert not is_self_similar(field, at(-3.5, 0.0))  # but for its long walls
-    assert not is_self_similar(field, at(-20.0, 0.0))  # nothing comes to lie on anything
+    assert not is_self_similar(field, at(-3.5, 0.0))  # only its long walls match
+    assert not is_self_similar(field, at(-20.0, 0.0))  # no overlap
 
 
 @pytest.mark.long
-def test_where_it_was_known_to_be_last_stays_a_place_if_it_explains_what_is_seen() -> None:
-    saved, view = hall(8), Rooms(HALL).view(at(12.0, 3.0))  # little of what is seen is mapped
+def test_the_last_known_pose_is_among_the_places_if_it_explains_the_scan() -> None:
+    saved, view = hall(8), Rooms(HALL).view(at(12.0, 3.0))  # little of the view is mapped
     field = field_of(saved.cells, saved.resolution, (saved.origin_x, saved.origin_y))
     scan = view.beams
-    assert ends(search(field, scan)) == [4.0, 11.4]  # the other end of the hall, and the next wall
-    assert ends(search(field, scan, at(12.0, 3.0))) == [4.0, 11.4, 11.9]
-    assert ends(search(field, scan, at(3.0, 3.0))) == [4.0, 11.4]
+    assert x_positions(search(field, scan)) == [
+        4.0,
+        11.4,
+    ]  # the other end of the hall, and the next wall
+    assert x_positions(search(field, scan, at(12.0, 3.0))) == [4.0, 11.4, 11.9]
+    assert x_positions(search(field, scan, at(3.0, 3.0))) == [4.0, 11.4]
 
 
 @pytest.mark.long
-def test_in_open_space_it_goes_on_by_odometry_until_that_is_too_vague(house: SavedMap) -> None:
+def test_in_open_space_odometry_is_used_until_it_is_too_uncertain(house: SavedMap) -> None:
     robot = walker(house, HOUSE, 3.0, 2.0)
     assert robot.look(15).localized
     robot.rooms = Rooms([(50, 50, 51, 51)])
@@ -181,23 +188,23 @@ def test_in_open_space_it_goes_on_by_odometry_until_that_is_too_vague(house: Sav
     assert not places[-1].localized
 
 
-def test_a_wall_that_stands_in_the_way_of_beams_counts_against_a_place(house: SavedMap) -> None:
+def test_beams_that_pass_through_a_wall_lower_the_score(house: SavedMap) -> None:
     field = field_of(house.cells, house.resolution, (house.origin_x, house.origin_y))
     view = Rooms(HOUSE).view(at(3.0, 2.5))
-    free = np.eye(3)
-    here = fit(field, view.beams, at(3.0, 2.5), free)
+    weak_prior = np.eye(3)
+    here = fit(field, view.beams, at(3.0, 2.5), weak_prior)
     long = np.array([[5.0, -1.5]] * len(view.scan.points), np.float32)  # through the inner wall
-    through = fit(field, view.beams._replace(free=long), at(3.0, 2.5), free)
+    through = fit(field, view.beams._replace(free=long), at(3.0, 2.5), weak_prior)
     assert here.score - through.score == pytest.approx(0.5, abs=0.06)
 
 
-def test_two_finds_that_come_to_the_same_do_not_forget_that_odometry_led_there() -> None:
+def test_two_candidates_that_merge_still_count_as_odometrys_place() -> None:
     rooms = Rooms(HALL)
     saved = drawn(rooms, *(at(x, y) for x in range(1, 16) for y in (1.0, 3.0, 5.0)))
     field = field_of(saved.cells, saved.resolution, (saved.origin_x, saved.origin_y))
     localizer = Localizer(field)
-    finds = ((11.16, 3.2, 0.0, 0.9), (10.84, 3.2, 0.0, 0.8), (5.0, 2.8, 180.0, 0.85))
-    candidates = [Candidate(at(x, y, turn), score) for x, y, turn, score in finds]
+    results = ((11.16, 3.2, 0.0, 0.9), (10.84, 3.2, 0.0, 0.8), (5.0, 2.8, 180.0, 0.85))
+    candidates = [Candidate(at(x, y, turn), score) for x, y, turn, score in results]
     localizer.found(candidates, at(0, 0), last=at(10.7, 3.2))
     for _ in range(5):
         place = localizer.step(rooms.view(at(11.0, 3.2)), at(0, 0), np.eye(3) * 1e-6)

@@ -1,4 +1,4 @@
-"""Maps on disk: what was saved comes back, what is damaged is refused, a good map is never lost."""
+"""Map files: saved maps are loaded, damaged ones are refused, and a good map is never lost."""
 
 import math
 from pathlib import Path
@@ -25,7 +25,7 @@ GRAPH = {"poses": np.arange(6.0).reshape(2, 3)}
 
 
 def room() -> SavedMap:
-    """6 x 5 m with walls all round, the last row unknown."""
+    """Return a map of 6 x 5 m with walls all round; the last row is unknown."""
     cells = np.zeros((100, 120), np.int8)
     cells[0], cells[:, 0], cells[:, -1], cells[98] = 100, 100, 100, 100
     cells[99] = -1
@@ -34,12 +34,12 @@ def room() -> SavedMap:
 
 @pytest.fixture
 def path(tmp_path: Path) -> Path:
-    where = tmp_path / "maps" / "room.yaml"
-    map_file.save(where, room(), GRAPH)
-    return where
+    map_path = tmp_path / "maps" / "room.yaml"
+    map_file.save(map_path, room(), GRAPH)
+    return map_path
 
 
-def test_a_map_comes_back_as_it_was_saved(path: Path) -> None:
+def test_a_loaded_map_equals_the_saved_one(path: Path) -> None:
     found = map_file.load(path)
     assert np.array_equal(found.cells, room().cells)
     assert (found.resolution, found.origin_x, found.origin_y) == (0.05, -2.35, 1.1)
@@ -62,7 +62,7 @@ def test_the_files_are_those_of_ros(path: Path) -> None:
     assert pixels[120 * 50 + 60] == 254
 
 
-def test_a_map_of_ros_with_comments_another_cell_size_and_white_walls_is_read(
+def test_a_ros_map_with_comments_another_cell_size_and_white_walls_is_read(
     tmp_path: Path,
 ) -> None:
     pixels = bytes((255, 0, 0, 128, 0, 0))
@@ -101,7 +101,7 @@ def enormous(image: bytes) -> bytes:
 
 
 @pytest.mark.parametrize(
-    ("damage", "told"),
+    ("damage", "message"),
     [
         (cut, "room.pgm: cut: 4985 of 120 x 100 pixels are there"),
         (longer, "room.pgm: of another size: 12001 of 120 x 100 pixels are there"),
@@ -111,17 +111,17 @@ def enormous(image: bytes) -> bytes:
         (enormous, "room.pgm: 120000 x 100000 pixels; expected 1 to 8000000 in all"),
     ],
 )
-def test_a_damaged_image_is_refused_in_one_line(damage: object, told: str, path: Path) -> None:
+def test_a_damaged_image_is_refused_in_one_line(damage: object, message: str, path: Path) -> None:
     image = path.with_suffix(".pgm")
     assert callable(damage)
     image.write_bytes(damage(image.read_bytes()))
     with pytest.raises(ConfigError) as error:
         map_file.load(path)
-    assert str(error.value) == f"{path.parent}/{told}"
+    assert str(error.value) == f"{path.parent}/{message}"
 
 
 @pytest.mark.parametrize(
-    ("line", "instead", "told"),
+    ("line", "instead", "message"),
     [
         ("origin: [-2.35, 1.1, 0.0]\n", "", "room.yaml:1: missing field 'origin'"),
         ("resolution: 0.05", "resolution: 0", "room.yaml:2: resolution"),
@@ -142,36 +142,38 @@ def test_a_damaged_image_is_refused_in_one_line(damage: object, told: str, path:
     ],
 )
 def test_a_wrong_description_is_refused_in_one_line(
-    line: str, instead: str, told: str, path: Path
+    line: str, instead: str, message: str, path: Path
 ) -> None:
     path.write_text(path.read_text().replace(line, instead, 1))
     with pytest.raises(ConfigError) as error:
         map_file.load(path)
-    assert told in str(error.value)
+    assert message in str(error.value)
     assert "\n" not in str(error.value)
 
 
-def test_an_image_that_is_longer_than_a_message_may_say_is_refused_in_one_line(path: Path) -> None:
+def test_an_image_that_is_too_long_for_a_message_is_refused_in_one_line(path: Path) -> None:
     path.with_suffix(".pgm").write_bytes(b"P5 100001 1 255\n" + bytes(100_001))
     with pytest.raises(ConfigError, match=r"100001 x 1 pixels; expected at most 100000 a side$"):
         map_file.load(path)
 
 
-@pytest.mark.parametrize("keep", [0, 100, 200])
-def test_a_cut_graph_is_refused_in_one_line(keep: int, path: Path) -> None:
+@pytest.mark.parametrize("kept_bytes", [0, 100, 200])
+def test_a_cut_graph_is_refused_in_one_line(kept_bytes: int, path: Path) -> None:
     graph = path.with_suffix(".graph.npz")
-    graph.write_bytes(graph.read_bytes()[:keep])
+    graph.write_bytes(graph.read_bytes()[:kept_bytes])
     with pytest.raises(ConfigError) as error:
         map_file.load_graph(path)
     assert f"{graph}: cut or damaged" in str(error.value)
     assert "\n" not in str(error.value)
 
 
-@pytest.mark.parametrize("bad", [np.array([math.nan, 0.0]), np.array(["x"]), np.array([1e300])])
-def test_a_graph_of_something_else_than_numbers_is_refused_in_one_line(
-    bad: NDArray[Any], path: Path
+@pytest.mark.parametrize(
+    "unusable", [np.array([math.nan, 0.0]), np.array(["x"]), np.array([1e300])]
+)
+def test_a_graph_with_other_values_than_numbers_is_refused_in_one_line(
+    unusable: NDArray[Any], path: Path
 ) -> None:
-    np.savez(path.with_suffix(".graph.npz"), poses=bad, allow_pickle=False)
+    np.savez(path.with_suffix(".graph.npz"), poses=unusable, allow_pickle=False)
     with pytest.raises(ConfigError, match=r"npz: cut or damaged: poses holds something"):
         map_file.load_graph(path)
 
@@ -201,20 +203,22 @@ def without_walls() -> SavedMap:
 
 
 @pytest.mark.parametrize(
-    ("bad", "told"),
+    ("unusable", "message"),
     [
         (empty(), "not saved: the map is empty: 0.00 m² of it are free"),
         (without_walls(), "not saved: the map has no walls: 0.00 m of them"),
     ],
 )
-def test_what_is_no_map_is_not_saved_over_a_good_one(bad: SavedMap, told: str, path: Path) -> None:
+def test_an_unusable_map_does_not_replace_a_good_one(
+    unusable: SavedMap, message: str, path: Path
+) -> None:
     with pytest.raises(Refused) as error:
-        map_file.save(path, bad, {}, replace=True)
-    assert str(error.value) == told
+        map_file.save(path, unusable, {}, replace=True)
+    assert str(error.value) == message
     assert np.array_equal(map_file.load(path).cells, room().cells)
 
 
-def test_another_map_is_overwritten_only_when_asked_to(path: Path) -> None:
+def test_a_map_is_only_overwritten_on_request(path: Path) -> None:
     other = SavedMap(np.roll(room().cells, 3, axis=1), 0.05, 0.0, 0.0)
     with pytest.raises(Refused, match=r"there is a map .*room\.yaml already; --replace"):
         map_file.save(path, other, GRAPH)
@@ -223,17 +227,17 @@ def test_another_map_is_overwritten_only_when_asked_to(path: Path) -> None:
     assert map_file.load(path).origin_x == 0.0
 
 
-def test_a_map_without_zones_and_objects_keeps_none_of_the_one_it_replaces(path: Path) -> None:
+def test_a_map_without_zones_and_objects_removes_those_of_the_replaced_map(path: Path) -> None:
     zones, objects = ZoneFile(places=(DOOR,)), ObjectFile(tags=(TAG,))
-    beside = {"zones": zone_file.encoded(zones), "objects": object_file.encoded(objects)}
-    map_file.save(path, room(), GRAPH, replace=True, **beside)
-    map_file.save(path, room(), GRAPH, replace=True, zones=beside["zones"], objects=None)
+    extra_files = {"zones": zone_file.encoded(zones), "objects": object_file.encoded(objects)}
+    map_file.save(path, room(), GRAPH, replace=True, **extra_files)
+    map_file.save(path, room(), GRAPH, replace=True, zones=extra_files["zones"], objects=None)
     assert (zone_file.load(path), object_file.load(path)) == (zones, objects)
     map_file.save(path, room(), GRAPH, replace=True)
     assert (zone_file.load(path), object_file.load(path)) == (ZoneFile(), ObjectFile())
 
 
-def test_a_save_that_fails_half_way_leaves_the_old_map(
+def test_a_save_that_fails_half_way_keeps_the_old_map(
     path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def full(_fd: int) -> None:
@@ -243,23 +247,23 @@ def test_a_save_that_fails_half_way_leaves_the_old_map(
     with pytest.raises(Refused, match="No space left on device"):
         map_file.save(path, room(), GRAPH, replace=True)
     monkeypatch.undo()
-    assert len(list(path.parent.iterdir())) == 3  # what was begun does not fill the disk
+    assert len(list(path.parent.iterdir())) == 3  # an unfinished save does not fill the disk
     assert np.array_equal(map_file.load(path).cells, room().cells)
     map_file.save(path, room(), GRAPH, replace=True)
     assert len(list(path.parent.iterdir())) == 3
 
 
-def test_a_map_that_cannot_be_looked_for_is_refused_in_one_line() -> None:
+def test_a_map_path_that_is_too_long_is_refused_in_one_line() -> None:
     for read in (map_file.load, map_file.load_graph):
         with pytest.raises(ConfigError, match="File name too long"):
             read(Path("/" + "room" * 100 + ".yaml"))
 
 
-def test_whoever_looks_next_finishes_a_save_that_a_crash_interrupted(path: Path) -> None:
+def test_the_next_reader_finishes_a_save_that_a_crash_interrupted(path: Path) -> None:
     complete = path.with_name(".room.complete")
     complete.mkdir()
     image = path.with_suffix(".pgm").read_bytes()
-    (complete / "room.pgm").write_bytes(image.replace(b"\xfe", b"\xcd"))  # free is unknown now
+    (complete / "room.pgm").write_bytes(image.replace(b"\xfe", b"\xcd"))  # free becomes unknown
     (complete / "room.yaml").write_text(path.read_text().replace("-2.35", "4.0"))
     found = map_file.load(path)
     assert found.origin_x == 4.0
@@ -267,7 +271,7 @@ def test_whoever_looks_next_finishes_a_save_that_a_crash_interrupted(path: Path)
     assert not complete.exists()
 
 
-def test_a_name_is_a_file_in_the_state_folder_and_a_path_is_itself(
+def test_a_name_is_a_file_in_the_state_folder_and_a_path_stays(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setenv("XDG_STATE_HOME", "/state")
@@ -277,7 +281,7 @@ def test_a_name_is_a_file_in_the_state_folder_and_a_path_is_itself(
 
 
 @pytest.mark.parametrize("name", ["office.yaml", "a.yml", "office\n", ".hidden", "../x", ""])
-def test_a_map_is_not_saved_under_a_name_that_would_be_a_file_elsewhere(name: str) -> None:
+def test_a_map_name_that_would_be_a_file_elsewhere_is_refused(name: str) -> None:
     with pytest.raises(msgspec.ValidationError):
         msgspec.convert({"name": name}, MapRequest)
     assert msgspec.convert({"name": "office-2.b"}, MapRequest).name == "office-2.b"

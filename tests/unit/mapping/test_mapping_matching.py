@@ -1,4 +1,4 @@
-"""Scans laid onto a map of the same room."""
+"""Scans are matched to a map of the same room."""
 
 import numpy as np
 import pytest
@@ -12,7 +12,7 @@ from tests.unit.mapping.rooms import Lidar, box
 
 ROOM = np.array([*box(-3, -2, 6, 4), *box(1, 0.5, 0.6, 0.4)])
 CORRIDOR = np.array([(-100.0, -1.0, 100.0, -1.0), (-100.0, 1.0, 100.0, 1.0)])
-FREE = np.zeros((3, 3))
+NO_PRIOR = np.zeros((3, 3))
 
 
 def mapped(lidar: Lidar, walls: Floats) -> LocalMap:
@@ -20,13 +20,13 @@ def mapped(lidar: Lidar, walls: Floats) -> LocalMap:
 
 
 @pytest.mark.parametrize("beams", [180, 360, 720])
-def test_a_displaced_scan_is_found_within_5_mm_and_a_fifth_of_a_degree(beams: int) -> None:
+def test_a_displaced_scan_is_matched_to_5_mm_and_a_fifth_of_a_degree(beams: int) -> None:
     lidar, there = Lidar(beams), np.array((0.2, -0.1, np.radians(8)))
     local, scan = mapped(lidar, ROOM), lidar.scan(ROOM, there)
     found = search(local.image, scan.points, IDENTITY, Window(0.35, 0.35))
     assert found.score > 0.8
     assert np.abs(found.pose - there).max() < 0.06
-    fit = icp(local.buckets, scan.points, found.pose, 0.3, FREE, found.pose)
+    fit = icp(local.buckets, scan.points, found.pose, 0.3, NO_PRIOR, found.pose)
     assert np.hypot(*(fit.pose - there)[:2]) < 0.005
     assert abs(fit.pose[2] - there[2]) < np.radians(0.2)
     assert fit.inliers > 0.9
@@ -39,7 +39,7 @@ def test_a_scan_of_another_room_scores_low() -> None:
     assert search(local.image, other.points, IDENTITY, Window(0.35, 0.35)).score < 0.35
 
 
-def test_along_a_corridor_without_ends_odometry_decides_and_is_not_believed_for_more() -> None:
+def test_along_an_endless_corridor_only_odometry_decides() -> None:
     lidar = Lidar(360, reach=5.0)
     local = mapped(lidar, CORRIDOR)
     scan, guess = lidar.scan(CORRIDOR, np.array((0.6, 0.05, 0.03))), np.array((0.5, 0.0, 0.0))
@@ -51,16 +51,16 @@ def test_along_a_corridor_without_ends_odometry_decides_and_is_not_believed_for_
 
 
 @pytest.mark.slow
-def test_without_points_there_is_nothing_to_find() -> None:
-    nothing = Scan.of(np.empty((0, 2)))
-    local = build([nothing], IDENTITY[None], IDENTITY, 0.05, 0.08)
-    assert search(local.image, nothing.points, IDENTITY, Window(0.3, 0.3)).score == 0.0
+def test_without_points_nothing_is_found() -> None:
+    empty = Scan.of(np.empty((0, 2)))
+    local = build([empty], IDENTITY[None], IDENTITY, 0.05, 0.08)
+    assert search(local.image, empty.points, IDENTITY, Window(0.3, 0.3)).score == 0.0
     scan = Lidar(180).scan(ROOM, IDENTITY)
     assert search(local.image, scan.points, IDENTITY, Window(0.3, 0.3)).score == 0.0
     assert icp(local.buckets, scan.points, IDENTITY, 0.3, np.eye(3), IDENTITY).inliers == 0.0
 
 
-def test_normals_stand_on_their_walls() -> None:
+def test_normals_are_perpendicular_to_their_walls() -> None:
     scan = Lidar(360, noise=0.0).scan(np.array(box(-2, -2, 4, 4)), IDENTITY)
     ahead = np.abs(scan.points[:, 1]) < 1.5
     right_wall = ahead & (scan.points[:, 0] > 1.9)
@@ -70,7 +70,7 @@ def test_normals_stand_on_their_walls() -> None:
     )
 
 
-def test_beams_say_where_they_hit_and_how_far_it_is_free() -> None:
+def test_beams_become_hits_and_free_ends() -> None:
     angles = np.array((0.0, np.pi / 2, np.pi, -np.pi / 2))
     scan = from_beams(angles, np.array((2.0, np.inf, 0.05, np.nan)), 0.1, 8.0, free_range=3.5)
     assert scan.points == pytest.approx(np.array(((2.0, 0.0),)))

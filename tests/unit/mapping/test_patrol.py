@@ -1,4 +1,4 @@
-"""A map of ground that is driven over again and again stops growing, stays right and follows."""
+"""A map of a patrol stops growing, stays right, and follows changes."""
 
 import numpy as np
 import pytest
@@ -14,12 +14,12 @@ from tests.unit.mapping.houses import HOUSE, PATIENCE_S, Rooms, Walker, at, box,
 
 START = (1.0, 2.5)
 ROUND = ((3.0, 3.0), (5.5, 3.0), (6.5, 4.8), (6.5, 1.8), (5.0, 3.0), (3.0, 4.5), (1.2, 3.8), START)
-FIRST, LATER = 3, 3  # rounds
-PILLAR, SHELF = box(2.0, 1.2, 2.4, 1.6), box(4.6, 4.2, 5.2, 4.8)  # moved from there to here
+FIRST_ROUNDS, LATER_ROUNDS = 3, 3
+PILLAR, SHELF = box(2.0, 1.2, 2.4, 1.6), box(4.6, 4.2, 5.2, 4.8)  # old and new place
 
 
 class Patrol:
-    """A robot that goes its rounds in the house."""
+    """A robot that drives rounds in the house."""
 
     def __init__(self) -> None:
         self.chart = SlamMap(PATIENCE_S)
@@ -41,7 +41,7 @@ class Patrol:
 @pytest.fixture(scope="module")
 def patrol() -> Patrol:
     patrol = Patrol()
-    patrol.rounds(FIRST + LATER)
+    patrol.rounds(FIRST_ROUNDS + LATER_ROUNDS)
     return patrol
 
 
@@ -49,19 +49,19 @@ def patrol() -> Patrol:
 def test_the_same_rounds_again_add_no_keyframes(patrol: Patrol) -> None:
     first = patrol.keyframes[0]
     assert patrol.keyframes[1] > 1.8 * first  # the second round is still mapped
-    assert patrol.keyframes[-1] <= patrol.keyframes[FIRST - 1] + 0.02 * first
+    assert patrol.keyframes[-1] <= patrol.keyframes[FIRST_ROUNDS - 1] + 0.02 * first
 
 
-def test_of_sweeps_the_newest_of_each_place_stay(patrol: Patrol) -> None:
+def test_only_the_newest_sweeps_of_each_place_stay(patrol: Patrol) -> None:
     assert patrol.sweeps[-1] - patrol.sweeps[-2] < 0.2 * patrol.sweeps[0]
 
 
-def test_on_known_ground_the_robot_is_where_it_is(patrol: Patrol) -> None:
-    assert max(patrol.errors[-LATER * len(ROUND) :]) < 0.04
+def test_on_known_ground_the_robots_pose_is_right(patrol: Patrol) -> None:
+    assert max(patrol.errors[-LATER_ROUNDS * len(ROUND) :]) < 0.04
 
 
 @pytest.mark.long
-def test_a_map_of_known_ground_is_saved_and_gone_on_with(patrol: Patrol) -> None:
+def test_a_map_of_known_ground_is_saved_and_continued(patrol: Patrol) -> None:
     _, arrays = patrol.chart.to_save()
     again = SlamMap.thaw(arrays, PATIENCE_S)
     assert again.report()["keyframes"] == patrol.keyframes[-1]
@@ -78,13 +78,13 @@ def test_a_map_of_known_ground_is_saved_and_gone_on_with(patrol: Patrol) -> None
 
 
 @pytest.mark.slow
-def test_furniture_that_is_moved_is_followed_and_adds_little() -> None:
+def test_moved_furniture_is_remapped_with_few_keyframes() -> None:
     patrol = Patrol()
-    patrol.rounds(FIRST)
+    patrol.rounds(FIRST_ROUNDS)
     before = patrol.chart.report()["keyframes"]
     moved = [wall for wall in HOUSE if wall not in PILLAR]
     patrol.walker.rooms = Rooms([*moved, *SHELF], seed=4)
-    patrol.rounds(LATER + 1)
+    patrol.rounds(LATER_ROUNDS + 1)
     assert max(patrol.errors) < 0.04
     assert before < patrol.keyframes[-1] < before + patrol.keyframes[0]
     assert patrol.keyframes[-1] - patrol.keyframes[-2] < 0.1 * patrol.keyframes[0]
@@ -94,7 +94,7 @@ def test_furniture_that_is_moved_is_followed_and_adds_little() -> None:
 
 
 def occupied(saved: SavedMap, x: float, y: float) -> bool:
-    """Return whether something stands within 0.1 m of a place of the house [m]."""
+    """Return whether the map has an obstacle within 0.1 m of (x, y) in the house."""
     place = between(at(*START), at(x, y))
     column, row = (round((v - o) / 0.05) for v, o in
                    zip(place[:2], (saved.origin_x, saved.origin_y), strict=True))  # fmt: skip
@@ -113,16 +113,16 @@ def around(travels: list[float], poses: Floats, now: float) -> list[int]:
     return ground.keyframes_near(IDENTITY, now, poses, {0})
 
 
-def test_ground_is_known_after_two_passes_that_are_over() -> None:
+def test_ground_is_known_after_two_finished_passes() -> None:
     poses = np.array(((0.5, 0.0, 0.0), (0.0, 0.1, 0.0), (0.2, 0.0, 0.0), IDENTITY))
-    assert around([0.0, 0.2, 30.0, 60.0], poses, 50.0) == [0, 2]  # of two in one square the newest
+    assert around([0.0, 0.2, 30.0, 60.0], poses, 50.0) == [0, 2]  # the newest of two in one square
     assert around([0.0, 0.2, 11.0, 11.2], poses, 50.0) == []
     assert around([0.0, 0.2, 30.0, 60.0], poses, 41.0) == []
     poses[2:, 0] += 1.0
     assert around([0.0, 0.2, 30.0, 60.0], poses, 50.0) == []
 
 
-def test_of_sweeps_from_one_place_the_newest_three_stay() -> None:
+def test_the_newest_three_sweeps_of_a_place_stay() -> None:
     sweeps = GridScans()
     for k in range(6):
         view = View(Scan.of(np.full((30, 2), float(k))), np.zeros(2))
