@@ -24,12 +24,12 @@ Box = tuple[float, float, float, float, float, float]  # x, y and z from and to 
 
 @dataclass(kw_only=True)
 class Scene:
-    """A floor at z = 0 that ends in a step down at `edge`, and boxes; a room of 4 m around it."""
+    """Boxes on a floor at z = 0, in a room. At `edge` the floor steps down by `drop`."""
 
     boxes: tuple[Box, ...] = ()
-    edge: float = math.inf  # [m], along x: beyond, the floor is lower
+    edge: float = math.inf  # [m], along x
     drop: float = 0.1  # [m]
-    room: float = 4.0  # [m] to its walls
+    room: float = 4.0  # [m], distance of its walls
 
     def depth(self, camera: Camera, pose: Pose) -> Floats:
         """Return the true depth (height, width) [m] from a body at `pose`."""
@@ -64,7 +64,7 @@ class Scene:
 
 
 class Eye:
-    """A depth camera in a scene, with the errors of a sensor. It makes the first plane alone."""
+    """A depth camera in a scene, with the errors of a sensor. It fills the first plane only."""
 
     def __init__(
         self, camera: Camera = CAMERA, seed: int = 0, errors: DepthErrors = SENSOR
@@ -79,7 +79,7 @@ class Eye:
         self._camera, self._sensor = camera, DepthSensor(half, seed, errors)
 
     def picture(self, scene: Scene, pose: Pose, tick: int = 1) -> DepthImage:
-        """Return what the camera sees from a body at `pose`."""
+        """Return the picture from a body at `pose`."""
         pixels = self._sensor.measure(scene.depth(self._sensor.mounted, pose))
         plane = zlib.compress(pixels.astype("<u2").tobytes(), 1)
         return DepthImage(

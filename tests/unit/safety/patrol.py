@@ -1,4 +1,4 @@
-"""Safety over time: one state a tick, a scan every fifth, and a body that does as it is told."""
+"""Safety over time: a state per tick, a scan every 5 ticks, and a body that follows commands."""
 
 import numpy as np
 from msgspec.structs import asdict, replace
@@ -26,7 +26,7 @@ LEVEL = (0.0, 0.0, 0.0, 1.0)
 
 
 def imu(orientation: tuple[float, float, float, float] = LEVEL, push: float = 0.0) -> ImuData:
-    """At rest, but for a horizontal `push` [m/s2]."""
+    """Return a sample at rest, with a horizontal acceleration `push` [m/s2]."""
     return ImuData(
         orientation=orientation,
         angular_velocity=(0.0, 0.0, 0.0),
@@ -35,7 +35,7 @@ def imu(orientation: tuple[float, float, float, float] = LEVEL, push: float = 0.
 
 
 class Patrol:
-    """A body under safety's eyes."""
+    """A body with safety, which starts with 10 ticks at rest."""
 
     def __init__(
         self, body: BodyDescription = BODY, values: NDArray[np.floating] | None = None
@@ -50,7 +50,7 @@ class Patrol:
         self,
         ticks: int = 1,
         *,
-        told: Velocity | None = None,
+        commanded: Velocity | None = None,
         moves: Velocity | None = None,
         values: NDArray[np.floating] | None = None,
         gate: GateStatus = DRIVING,
@@ -67,24 +67,24 @@ class Patrol:
         age_ms: float = 0.0,
         scan_late_ms: float = 0.0,
     ) -> list[str]:
-        """So many ticks like this; the codes of the causes after the last."""
-        asked = told or Velocity()
+        """Run some ticks; return the codes of the causes after the last one."""
+        twist = commanded or Velocity()
         for _ in range(ticks):
             self.tick += 1
             if not frozen:
-                self.state = self._state(moves or asked, battery, joints, imu, bumpers)
+                self.state = self._state(moves or twist, battery, joints, imu, bumpers)
             link = LinkHealth(connected=connected, age_ms=age_ms, late_ms=late_ms)
             self.state = replace(
-                self.state, tick=self.tick, basis=self.tick, gate=gate, link=link, sent=asked
+                self.state, tick=self.tick, basis=self.tick, gate=gate, link=link, sent=twist
             )
             command = CmdVel(
-                **asdict(asked), source="control", boot=self.state.boot, tick=self.tick - 1
+                **asdict(twist), source="control", boot=self.state.boot, tick=self.tick - 1
             )
-            seen = self.tick - self.tick % 5
-            looked = scan(open_space() if values is None else values, seen)
+            basis = self.tick - self.tick % 5
+            newest = scan(open_space() if values is None else values, basis)
             inputs = SafetyInputs(
                 state=self.state,
-                scan=replace(looked, late_ms=scan_late_ms) if seen else None,
+                scan=replace(newest, late_ms=scan_late_ms) if basis else None,
                 scan_age_ns=0,
                 command=command,
                 echo_ages=echo_ages,
@@ -121,18 +121,18 @@ class Patrol:
 
     @property
     def codes(self) -> list[str]:
-        """Of the causes now."""
+        """Codes of the present causes."""
         return [cause.code for cause in self.verdict.causes]
 
     @property
     def warnings(self) -> list[str]:
-        """Their codes."""
+        """Codes of the present warnings."""
         return [warning.code for warning in self.verdict.warnings]
 
-    def ticks_until(self, code: str, most: int, **moment: object) -> int:
-        """After how many ticks like this `code` is among causes and warnings."""
-        for tick in range(1, most + 1):
+    def ticks_until(self, code: str, limit: int, **moment: object) -> int:
+        """Return the number of ticks until `code` is among causes and warnings."""
+        for tick in range(1, limit + 1):
             self.go(**moment)  # type: ignore[arg-type]
             if code in self.codes + self.warnings:
                 return tick
-        raise AssertionError(f"no {code} within {most} ticks: {self.codes} {self.warnings}")
+        raise AssertionError(f"no {code} within {limit} ticks: {self.codes} {self.warnings}")

@@ -1,4 +1,4 @@
-"""Distances of an arm by MuJoCo: what safety takes, and what it measures."""
+"""Distances of an arm by MuJoCo: accepted models, distances and gradients."""
 
 import subprocess
 import sys
@@ -74,7 +74,7 @@ def distances(arm: MujocoArm, posture: NDArray[np.float64]) -> dict[int, float]:
         ("<mujoco/>", "no joint 'shoulder_pan'"),
     ],
 )
-def test_a_model_that_safety_does_not_take_is_refused_in_one_line(text: str, says: str) -> None:
+def test_an_unsupported_model_is_refused_in_one_line(text: str, says: str) -> None:
     with pytest.raises(ConfigError, match=says) as error:
         MujocoArm(text, BODY)
     assert "\n" not in str(error.value)
@@ -97,7 +97,7 @@ def check_gradients(arm: MujocoArm, postures: NDArray[np.float64]) -> None:
     assert checked > 100
 
 
-def test_gradients_of_distances_are_those_of_the_distances() -> None:
+def test_gradients_match_differences_of_distances() -> None:
     lower, upper = np.array([(joint.lower, joint.upper) for joint in BODY.joints]).T
     check_gradients(
         MujocoArm(model(), BODY), np.random.default_rng(1).uniform(lower, upper, (8, len(lower)))
@@ -120,31 +120,31 @@ def test_the_lowest_point_of_each_kind_of_shape_is_above_the_floor(kind: str, si
     check_gradients(arm, np.random.default_rng(2).uniform(0.1, 0.19, (20, 2)))
 
 
-def test_a_joint_that_an_equality_ties_to_another_moves_with_it() -> None:
+def test_an_equality_makes_a_joint_follow_another() -> None:
     arm = MujocoArm(ROUND.format(kind="sphere", size=".05"), TWO)
     near = within(arm, np.array([0.3, 0.1]))
     named = {arm.describe(pair)[1:]: index for index, pair in enumerate(near.pairs.tolist())}
     tip = near.gradients[named["end", "the floor"], 1]
     other = near.gradients[named["mirror", "the floor"], 1]
-    assert other == pytest.approx(-tip)  # it goes back twice as far as what carries it
+    assert other == pytest.approx(-tip)  # twice the motion of its parent, in the other direction
 
 
-def test_what_is_near_in_many_postures_is_what_is_near_in_each() -> None:
+def test_many_postures_at_once_give_the_same_pairs_as_each_alone() -> None:
     lower, upper = np.array([(joint.lower, joint.upper) for joint in BODY.joints]).T
     arm, rng = MujocoArm(model(), BODY), np.random.default_rng(3)
     postures = rng.uniform(lower, upper, (20, len(lower)))
     limits_of_pairs = rng.uniform(-0.01, 0.15, (20, len(arm.levers)))
     near = arm.near(postures, limits_of_pairs)
     for index, posture in enumerate(postures):
-        each, one = distances(arm, posture), near.postures == index
-        found = dict(zip(near.pairs[one].tolist(), near.distances[one].tolist(), strict=True))
-        most = limits_of_pairs[index].tolist()
-        assert found == pytest.approx({p: d for p, d in each.items() if d < most[p]}, abs=1e-6)
+        each, rows = distances(arm, posture), near.postures == index
+        found = dict(zip(near.pairs[rows].tolist(), near.distances[rows].tolist(), strict=True))
+        limit = limits_of_pairs[index].tolist()
+        assert found == pytest.approx({p: d for p, d in each.items() if d < limit[p]}, abs=1e-6)
         gradients = within(arm, posture).gradients[[list(each).index(pair) for pair in found]]
-        assert near.gradients[one] == pytest.approx(gradients, abs=1e-6)
+        assert near.gradients[rows] == pytest.approx(gradients, abs=1e-6)
 
 
-def test_neighbours_and_what_cannot_move_apart_are_no_pairs() -> None:
+def test_neighbours_and_shapes_that_cannot_move_apart_are_no_pairs() -> None:
     arm = MujocoArm(model(), BODY)
     pairs = {arm.describe(pair)[1:] for pair in range(len(arm.levers))}
     chain = ["base", "shoulder", "upper_arm", "lower_arm", "wrist", "gripper", "jaw"]
@@ -155,15 +155,17 @@ def test_neighbours_and_what_cannot_move_apart_are_no_pairs() -> None:
 
 @pytest.mark.long
 def test_an_arm_that_falls_towards_the_floor_is_stopped_in_time() -> None:
-    """The gate's part is played by the caps alone, a tick late, and greatest accelerations."""
+    """Only the caps, a tick late, and the maximum accelerations limit the speeds."""
     arm, dt = MujocoArm(model(), replace(BODY, arm=replace(SO101.arm, floor=0.0))), 0.02
     posture, speeds = np.array([0.0, -0.4, 0.4, 0.0, 0.0, 0.0]), np.zeros(6)
     wanted = np.array([0.0, 3.0, 3.0, 3.0, 0.0, 0.0])
     lower, upper = np.array([(joint.lower, joint.upper) for joint in BODY.joints]).T
     caps = [np.full(6, np.inf)] * 2
     for _ in range(200):
-        there = [JointMotion(*one) for one in zip(posture.tolist(), speeds.tolist(), strict=True)]
-        found = limits(BODY.joints, arm, posture.tolist(), speeds.tolist(), there, 0.005)
+        motion = [
+            JointMotion(*pair) for pair in zip(posture.tolist(), speeds.tolist(), strict=True)
+        ]
+        found = limits(BODY.joints, arm, posture.tolist(), speeds.tolist(), motion, 0.005)
         by_name = {cap.name: cap.rise for cap in found.caps}
         rises = [by_name.get(joint.name) for joint in BODY.joints]
         caps = [caps[1], np.array([np.inf if rise is None else rise for rise in rises])]
@@ -175,7 +177,7 @@ def test_an_arm_that_falls_towards_the_floor_is_stopped_in_time() -> None:
 
 
 @pytest.mark.long
-def test_mujoco_is_imported_for_an_arm_alone() -> None:
+def test_mujoco_is_only_imported_for_an_arm() -> None:
     code = "import sys, gigabrain_zenoh.safety.node; print('mujoco' in sys.modules)"
     path = f"import sys; sys.path[:] = {sys.path!r}; {code}"
     done = subprocess.run((sys.executable, "-c", path), capture_output=True, text=True)

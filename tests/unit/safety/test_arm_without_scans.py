@@ -1,4 +1,4 @@
-"""An arm that is fixed has neither scans nor worlds, and safety waits for none."""
+"""A fixed arm has neither scans nor worlds, so safety waits for none."""
 
 import pytest
 
@@ -39,10 +39,10 @@ def test_silent_perception_is_no_cause(gate: GateStatus) -> None:
 
 
 @pytest.mark.parametrize("system", ["decision", "control"])
-def test_a_silent_part_of_its_brain_is(system: str) -> None:
+def test_silent_decision_or_control_is_a_cause(system: str) -> None:
     assert codes(("perception", system), ENABLED) == [f"{system}_silent"]
     assert codes(("perception", system), IDLE) == [f"{system}_silent"]
 
 
-def test_a_script_need_not_wait_for_a_brain_that_is_not_there() -> None:
+def test_a_script_need_not_wait_for_a_missing_brain() -> None:
     assert codes(("perception", "decision", "control"), IDLE) == []

@@ -1,4 +1,4 @@
-"""Gaps that Nav2's collision monitor leaves open (facts a to k), one test for each."""
+"""Gaps of Nav2's collision monitor (a to k), one test for each. Docstrings tell what Nav2 does."""
 
 import math
 
@@ -45,7 +45,7 @@ AHEAD = Velocity(linear_x=0.2)
 
 
 async def test_a_it_judges_without_any_command() -> None:
-    """There it runs only when a command comes: a dead commander leaves the body as it is."""
+    """In Nav2 only a command triggers it: a dead commander leaves the body as it is."""
     async with NodeBench(safety.run) as bench:
         bench.send(BODY_TOPIC, body())
         for tick in range(1, 41):
@@ -59,7 +59,7 @@ async def test_a_it_judges_without_any_command() -> None:
 
 
 def test_b_a_command_that_is_not_a_number_is_zero_at_once() -> None:
-    """There it is ignored, and the body keeps the last."""
+    """In Nav2 it is ignored, and the body keeps the last command."""
     rig = driving(0.2)
     rig.feed(gate.NotFinite("control", rig.state.boot))
     rig.tick()
@@ -67,7 +67,7 @@ def test_b_a_command_that_is_not_a_number_is_zero_at_once() -> None:
 
 
 async def test_c_a_scan_stamped_in_the_future_goes_stale() -> None:
-    """There it never does."""
+    """In Nav2 it never does."""
     async with NodeBench(safety.run) as bench:
         bench.send(BODY_TOPIC, body())
         for tick in range(1, 41):
@@ -79,8 +79,8 @@ async def test_c_a_scan_stamped_in_the_future_goes_stale() -> None:
     assert min(lost) == 23  # 260 ms after the last
 
 
-def test_c_scans_of_ticks_to_come_do_not_hide_that_none_is_true() -> None:
-    memory, found = Patrol().memory, []  # it has seen those of the ticks 5 and 10
+def test_c_scans_with_future_ticks_do_not_hide_that_valid_ones_are_missing() -> None:
+    memory, found = Patrol().memory, []  # with the scans of ticks 5 and 10
     for tick in range(11, 41):
         future = scan(open_space(), tick + 1000)
         inputs = SafetyInputs(state=state(tick), scan=future, scan_age_ns=0)
@@ -94,22 +94,22 @@ def test_c_scans_of_ticks_to_come_do_not_hide_that_none_is_true() -> None:
 
 @pytest.mark.parametrize("value", [math.nan, 0.0, 1e9, -1.0, -math.inf])
 def test_d_a_blind_lidar_is_not_free_space(value: float) -> None:
-    """There values that cannot be are dropped, and what is left is free."""
+    """In Nav2 impossible values are dropped, and the rest is free."""
     patrol = Patrol()
     assert patrol.go(5, values=np.full(360, value)) == ["scan_blind"]
     assert patrol.verdict.verdict == "stop"
 
 
 def test_e_the_zone_goes_by_the_measured_speed_while_coasting() -> None:
-    """There the commanded speed chooses it: 0 takes the smallest."""
+    """In Nav2 the commanded speed selects it: 0 takes the smallest."""
     patrol = Patrol()
-    patrol.go(60, told=AHEAD)
+    patrol.go(60, commanded=AHEAD)
     patrol.go(10, moves=AHEAD)
     assert patrol.go(5, moves=AHEAD, values=open_space(deg_0=0.22)) == ["zone_ahead"]
 
 
 def test_f_there_is_no_speed_without_a_zone() -> None:
-    """There a speed outside all ranges keeps the polygon of before."""
+    """In Nav2 a speed outside all ranges keeps the previous polygon."""
     forward = brakes(BODY)["forward"]
     assert forward.distance(0.26) == pytest.approx(0.197, abs=0.001)
     assert forward.distance(5.0) == pytest.approx(14.18)
@@ -128,13 +128,13 @@ def test_f_there_is_no_speed_without_a_zone() -> None:
     ],
 )  # fmt: skip
 def test_g_no_check_can_be_switched_off_by_a_zero(name: str) -> None:
-    """There a source_timeout of 0 removes the check."""
+    """In Nav2 a source_timeout of 0 removes the check."""
     with pytest.raises(msgspec.ValidationError):
         msgspec.convert({name: 0.0}, Thresholds)
 
 
 async def test_h_nobody_can_switch_it_off() -> None:
-    """There a service toggles it, and another moves its zones, for any caller."""
+    """In Nav2 any caller can toggle it, and move its zones, by services."""
     async with NodeBench(safety.run) as bench:
         bench.send(BODY_TOPIC, body())
         stranger = bench.network.transport()
@@ -143,20 +143,20 @@ async def test_h_nobody_can_switch_it_off() -> None:
         ]
         received = set(bench.bus.listens)
     assert answers == [[]] * len(SERVICES)
-    assert received == {topic.at("*") for topic in MONITORED}  # what is measured, and no orders
+    assert received == {topic.at("*") for topic in MONITORED}  # measurements, but no requests
 
 
 @pytest.mark.parametrize("degrees", range(-20, 21, 5))
 def test_i_one_beam_on_a_chair_leg_is_enough(degrees: int) -> None:
-    """There four to six points are wanted: a leg of 2 cm returns one or two."""
+    """Nav2 wants four to six points: a leg of 2 cm returns one or two."""
     patrol = Patrol()
-    patrol.go(60, told=AHEAD)
+    patrol.go(60, commanded=AHEAD)
     values = open_space(**{f"deg_{degrees % 360}": 0.2})
-    assert patrol.go(5, told=AHEAD, values=values) == ["zone_ahead"]
+    assert patrol.go(5, commanded=AHEAD, values=values) == ["zone_ahead"]
 
 
-def test_j_it_never_stops_saying_stop() -> None:
-    """There zeros are no longer sent after a second or two."""
+def test_j_stop_is_published_for_as_long_as_it_holds() -> None:
+    """Nav2 sends no zeros any more after a second or two."""
     patrol = Patrol()
     for _ in range(100):
         patrol.go(25, values=np.full(360, np.nan))
@@ -172,7 +172,7 @@ def test_j_it_never_stops_saying_stop() -> None:
     "footprint", [[], [[0.1, 0.1]], [[0, 0], [1, 0], [2, 0]], [[0, 0], [0, 0], [0, 0]]]
 )
 def test_k_a_footprint_that_encloses_nothing_is_refused(footprint: list[list[float]]) -> None:
-    """There an empty footprint skips the zone."""
+    """In Nav2 an empty footprint skips the zone."""
     file = {
         "summary": "x",
         "robot_type": "x",
@@ -185,14 +185,14 @@ def test_k_a_footprint_that_encloses_nothing_is_refused(footprint: list[list[flo
         msgspec.convert(file, RobotFile)
 
 
-def test_a_body_that_is_faster_than_its_lidar_sees_is_refused() -> None:
+def test_a_body_that_cannot_stop_within_its_lidars_range_is_refused() -> None:
     whole = msgspec.to_builtins(BODY)
     with pytest.raises(msgspec.ValidationError, match=r"takes 14\.18 m to stop"):
         msgspec.convert({**whole, "max_linear_speed": 5.0}, BodyDescription)
 
 
 @pytest.mark.parametrize("name", ["follow_linear", "follow_angular"])
-def test_a_body_is_refused_that_could_run_away_unseen(name: str) -> None:
+def test_a_tolerance_that_hides_a_runaway_is_refused(name: str) -> None:
     whole = msgspec.to_builtins(BODY)
     with pytest.raises(msgspec.ValidationError, match=rf"thresholds: {name}: it is never so far"):
         msgspec.convert({**whole, "thresholds": {name: 100.0}}, BodyDescription)

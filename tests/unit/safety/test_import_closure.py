@@ -1,4 +1,4 @@
-"""Safety and the gate see little of the code: what their pure steps import is counted."""
+"""The pure steps of safety and gate import few modules."""
 
 import subprocess
 import sys
@@ -14,9 +14,9 @@ print(sum(name.startswith(("gigabrain_zenoh", "gigabrain_schemas")) for name in 
 
 @pytest.mark.long
 @pytest.mark.parametrize(
-    ("module", "most"), [("gigabrain_zenoh.safety.step", 34), ("gigabrain_zenoh.gate.gate", 15)]
+    ("module", "limit"), [("gigabrain_zenoh.safety.step", 34), ("gigabrain_zenoh.gate.gate", 15)]
 )
-def test_a_pure_step_imports_few_modules(module: str, most: int) -> None:
+def test_a_pure_step_imports_few_modules(module: str, limit: int) -> None:
     done = subprocess.run(
         (
             sys.executable,
@@ -27,4 +27,4 @@ def test_a_pure_step_imports_few_modules(module: str, most: int) -> None:
         text=True,
     )
     assert done.returncode == 0, done.stderr
-    assert int(done.stdout) <= most
+    assert int(done.stdout) <= limit

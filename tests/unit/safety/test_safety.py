@@ -1,4 +1,4 @@
-"""Safety's step: what stops the body, what slows it down, and after how long."""
+"""Safety's step: causes that stop or slow the body, and after how long."""
 
 import numpy as np
 import pytest
@@ -19,8 +19,8 @@ BODY = replace(WAFFLE, thresholds=Thresholds(reaction_time=0.32, stop_margin=0.0
 ALL = ("perception", "decision", "control")
 
 
-def begun(boot: int = 7) -> SafetyMemory:
-    """It has looked at one scan already."""
+def after_one_scan(boot: int = 7) -> SafetyMemory:
+    """Return the memory after one scan."""
     return SafetyMemory(boot=boot, field=ProtectiveField(scans=1))
 
 
@@ -33,7 +33,7 @@ def judge(
     memory: SafetyMemory | None = None,
     body: BodyDescription = BODY,
 ) -> SafetyState:
-    """The verdict on one moment."""
+    """Return the verdict on one tick."""
     now = at or state(1)
     inputs = SafetyInputs(
         state=now,
@@ -41,7 +41,7 @@ def judge(
         scan_age_ns=None if age_ms is None else round(age_ms * MS),
         silent=silent,
     )
-    return step(body, memory or begun(now.boot), inputs)[1]
+    return step(body, memory or after_one_scan(now.boot), inputs)[1]
 
 
 def codes(verdict: SafetyState) -> list[str]:
@@ -49,15 +49,15 @@ def codes(verdict: SafetyState) -> list[str]:
 
 
 class Watch:
-    """Safety over time: a tick and a fresh scan at each call, free space unless it is said."""
+    """Safety over time: each call is a tick with a new scan of free space or an obstacle."""
 
     def __init__(self) -> None:
-        self.memory, self.tick = begun(), 0
+        self.memory, self.tick = after_one_scan(), 0
 
     def sees(
         self, ahead: float | None = None, behind: float | None = None, v: float = 0.0
     ) -> SafetyState:
-        """The verdict with so much room, at a speed of `v`."""
+        """Return the verdict with free distances [m], at the speed `v` [m/s]."""
         self.tick += 1
         values = open_space()
         if ahead is not None:
@@ -73,7 +73,7 @@ class Watch:
         return verdict
 
 
-def test_all_is_well() -> None:
+def test_without_faults_the_verdict_is_ok() -> None:
     assert judge() == SafetyState(verdict="ok")
 
 
@@ -95,7 +95,7 @@ def test_a_slow_lidar_may_take_one_and_a_half_periods() -> None:
 @pytest.mark.parametrize(
     ("rate_hz", "limit_ms"), [(50.0, 250), (10.0, 250), (6.0, 250), (5.0, 300), (2.0, 750)]
 )
-def test_sensor_data_that_moves_the_body_is_at_most_so_old(rate_hz: float, limit_ms: int) -> None:
+def test_the_age_limit_of_scans_depends_on_the_lidars_rate(rate_hz: float, limit_ms: int) -> None:
     assert scan_limit_ns(replace(BODY, lidar=replace(LIDAR, rate_hz=rate_hz))) == limit_ms * MS
     assert scan_limit_ns(replace(BODY, lidar=None)) == 250 * MS
 
@@ -114,7 +114,7 @@ def test_a_blind_lidar_stops_the_body(values: np.ndarray, text: str) -> None:
     assert plain(verdict.causes) == [("scan_blind", text)]
 
 
-def test_a_lidar_that_sees_nothing_of_what_is_ahead_stops_the_body() -> None:
+def test_a_lidar_without_a_valid_beam_ahead_stops_the_body() -> None:
     values = np.linspace(1.0, 2.0, 360)
     values[:16] = values[-15:] = np.nan
     assert codes(judge(seen=scan(values))) == ["scan_blind"]
@@ -135,7 +135,7 @@ def test_a_silent_system_stops_the_body_while_the_brain_drives(name: str) -> Non
     ("commander", "silent", "expected"),
     [
         ("control", ALL, "stop"),
-        ("script", ALL, "ok"),  # a person or a script looks itself
+        ("script", ALL, "ok"),  # a person or a script watches instead
         ("", ("decision",), "stop"),  # the brain would be next
         ("", ("perception", "decision"), "stop"),
         ("", ALL, "ok"),  # there is no brain, and a script need not wait for one
@@ -176,7 +176,7 @@ def test_a_closed_zone_opens_again_with_ten_centimetres_to_spare() -> None:
     assert codes(watch.sees(ahead=0.17)) == []
 
 
-def test_a_zone_goes_by_the_speed_towards_it() -> None:
+def test_a_zone_depends_on_the_speed_towards_it() -> None:
     assert codes(Watch().sees(ahead=0.1, v=-0.26)) == []
     assert codes(Watch().sees(behind=0.1, v=0.26)) == []
 
@@ -184,7 +184,7 @@ def test_a_zone_goes_by_the_speed_towards_it() -> None:
 def test_a_scan_waits_for_the_state_of_its_tick() -> None:
     near = open_space(deg_0=0.2)
     memory, verdict = step(
-        BODY, begun(), SafetyInputs(state=state(4), scan=scan(near, 5), scan_age_ns=0)
+        BODY, after_one_scan(), SafetyInputs(state=state(4), scan=scan(near, 5), scan_age_ns=0)
     )
     assert (memory.field.basis, memory.field.free, codes(verdict)) == (0, {}, ["starting"])
     memory, verdict = step(
@@ -197,14 +197,14 @@ def test_a_scan_waits_for_the_state_of_its_tick() -> None:
 def test_a_scan_is_judged_once_by_the_speed_of_its_own_time() -> None:
     seen = scan(open_space(deg_0=0.255), 1)  # 0.18 m free
     memory, first = step(
-        BODY, begun(), SafetyInputs(state=state(1, v=0.2), scan=seen, scan_age_ns=0)
+        BODY, after_one_scan(), SafetyInputs(state=state(1, v=0.2), scan=seen, scan_age_ns=0)
     )
     _, later = step(BODY, memory, SafetyInputs(state=state(3, v=0.26), scan=seen, scan_age_ns=0))
     assert codes(first) == codes(later) == []
-    assert first.caps == later.caps  # which keep it from becoming faster than the zone allows
+    assert first.caps == later.caps  # they keep the speed within what the zone allows
 
 
-def test_a_blind_scan_says_nothing_of_the_room_ahead() -> None:
+def test_a_blind_scan_has_no_free_distances() -> None:
     watch = Watch()
     watch.sees(ahead=0.1, v=0.2)
     watch.tick += 1
@@ -216,7 +216,7 @@ def test_a_blind_scan_says_nothing_of_the_room_ahead() -> None:
     assert codes(verdict) == ["scan_blind"]
 
 
-def test_a_new_start_of_the_driver_is_judged_afresh() -> None:
+def test_a_restart_of_the_driver_resets_the_memory() -> None:
     watch = Watch()
     watch.sees(ahead=0.1, v=0.2)
     now = state(1, boot=8, battery=1.0)
@@ -237,20 +237,20 @@ def test_nothing_moves_before_the_second_scan() -> None:
     assert step(bare, SafetyMemory(), SafetyInputs(state=state(1)))[1] == SafetyState(verdict="ok")
 
 
-def test_with_the_first_scan_it_reports_who_has_not_published_yet() -> None:
-    """Later it is known whether there is a brain at all, which a script need not wait for."""
-    everybody, memory, found = ("perception", "decision", "control"), SafetyMemory(), []
+def test_at_the_first_scan_it_reports_systems_that_have_not_published_yet() -> None:
+    """Later it knows whether there is a brain; a script need not wait for a missing one."""
+    systems, memory, found = ("perception", "decision", "control"), SafetyMemory(), []
     for tick, basis in ((1, 0), (2, 2), (5, 2), (7, 7)):
         seen = scan(open_space(), basis) if basis else None
         now = state(tick, gate=GateStatus(mode="idle"))
-        inputs = SafetyInputs(state=now, scan=seen, scan_age_ns=0, silent=everybody)
+        inputs = SafetyInputs(state=now, scan=seen, scan_age_ns=0, silent=systems)
         memory, verdict = step(BODY, memory, inputs)
         found.append([code for code in codes(verdict) if code in BRAIN_SILENT])
-    all_silent = [f"{name}_silent" for name in everybody]
+    all_silent = [f"{name}_silent" for name in systems]
     assert found == [[], all_silent, all_silent, []]
 
 
-def test_several_causes_stand_side_by_side() -> None:
+def test_a_verdict_can_have_several_causes() -> None:
     watch = Watch()
     watch.sees(ahead=0.05)
     inputs = SafetyInputs(

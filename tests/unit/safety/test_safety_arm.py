@@ -1,4 +1,4 @@
-"""Safety's monitors of joints: what stops an arm, after how long, and what does not."""
+"""Safety's monitors of joints: which faults stop an arm, and after how long."""
 
 from typing import Any
 
@@ -54,7 +54,7 @@ class Wall:
 
 
 class Crane:
-    """An arm of two joints under safety's eyes. Its joints are where they were sent."""
+    """An arm of two joints with safety. The joints are at their setpoints by default."""
 
     def __init__(self, body: BodyDescription = BODY, **fields: Any) -> None:
         self.body, self.memory, self.tick = body, SafetyMemory(), 0
@@ -76,7 +76,7 @@ class Crane:
         volts: float = 7.4,
         **fields: Any,
     ) -> list[str]:
-        """Let so many ticks pass; return the codes of the causes after the last."""
+        """Run some ticks; return the codes of the causes after the last one."""
         extra = {key: fields.pop(key) for key in ("current", "temperature") if key in fields}
         inputs = {key: fields.pop(key) for key in ("shape", "problem") if key in fields}
         self.fields |= inputs
@@ -123,7 +123,7 @@ class Crane:
         ({"temperature": 71.0}, "motor_hot", 25),
     ],
 )
-def test_what_lasts_stops_the_arm_until_a_person_has_looked(
+def test_a_lasting_fault_stops_the_arm_and_latches(
     fields: dict[str, Any], code: str, ticks: int
 ) -> None:
     crane = Crane()
@@ -147,7 +147,7 @@ def test_what_lasts_stops_the_arm_until_a_person_has_looked(
         {"temperature": 59.0},
     ],
 )
-def test_what_is_within_its_limits_stops_nothing(fields: dict[str, Any]) -> None:
+def test_values_within_limits_do_not_stop_the_arm(fields: dict[str, Any]) -> None:
     crane = Crane(**({"limp": True} if "limp" in fields else {}))
     crane.go(1, **{key: value / 2 for key, value in fields.items() if key in ("at", "grip")})
     assert crane.go(300, **fields) == []
@@ -166,7 +166,7 @@ class Far(Wall):
         return Near(none, none, np.zeros(0), np.zeros((0, 2)))
 
 
-def test_a_joint_that_repeats_itself_while_it_is_sent_elsewhere_is_frozen() -> None:
+def test_a_joint_that_repeats_its_values_away_from_its_setpoint_is_frozen() -> None:
     crane = Crane(noise=0.0)
     assert crane.go(19, sent=0.3, at=0.0, noise=0.0) == []
     assert crane.go(1, sent=0.3, at=0.0, noise=0.0) == ["joint_frozen"]
@@ -174,19 +174,19 @@ def test_a_joint_that_repeats_itself_while_it_is_sent_elsewhere_is_frozen() -> N
     assert crane.go(1, sent=0.3, at=0.001, noise=0.0) == []
 
 
-def test_a_joint_that_rests_may_repeat_itself() -> None:
+def test_a_joint_at_rest_may_repeat_its_values() -> None:
     assert Crane(noise=0.0).go(300, noise=0.0) == []
 
 
 @pytest.mark.parametrize(("to", "codes"), [(0.13, ["joint_jump"]), (0.11, [])])
-def test_a_joint_that_moves_faster_than_it_can_has_jumped(to: float, codes: list[str]) -> None:
-    """At 1 rad/s with a half more, in one tick and three that may have come late: 0.12 rad."""
+def test_a_joint_that_moves_faster_than_it_can_jumps(to: float, codes: list[str]) -> None:
+    """The limit is 0.12 rad: 1.5 times 1 rad/s, for one tick and 3 ticks of delay."""
     crane = Crane(noise=0.0)
-    assert crane.go(LATCHING_TICKS, at=to, noise=0.0) == codes  # told for so long
+    assert crane.go(LATCHING_TICKS, at=to, noise=0.0) == codes  # reported for so long
     assert crane.go(1, at=to, noise=0.0) == []
 
 
-def test_a_lost_link_says_nothing_of_the_joints() -> None:
+def test_joints_are_not_judged_while_the_link_is_lost() -> None:
     crane = Crane()
     gone = LinkHealth(connected=False)
     assert crane.go(200, sent=0.4, at=0.0, link=gone, noise=0.0) == []
@@ -199,7 +199,7 @@ def test_without_a_model_the_arm_does_not_move() -> None:
     assert crane.verdict.causes[0].text == "it has a mesh"
 
 
-def test_near_a_box_it_only_moves_away() -> None:
+def test_near_a_box_the_arm_only_moves_away() -> None:
     crane = Crane()
     crane.go(30, sent=0.485)
     assert crane.codes == ["arm_keep_out"]

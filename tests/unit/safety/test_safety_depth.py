@@ -1,4 +1,4 @@
-"""Depth images in safety: low things, steps, overhangs, memory, and cameras that fail."""
+"""Depth images in safety: low objects, steps, overhangs, memory and camera faults."""
 
 import math
 from collections.abc import Callable
@@ -21,7 +21,7 @@ from gigabrain_zenoh.testing.samples import BOOT, open_space, scan, state
 from tests.unit.safety.depth_scene import CAMERA, LOW, SEEING, Eye, Scene, image
 
 ORIGIN = Pose(x=0.0, y=0.0, yaw=0.0)
-FRONT, MARGIN = 0.075, 0.08  # [m], of the body, and what it keeps free before it
+FRONT = 0.075  # [m], front of the body
 REST, AHEAD, BACK, LEFT = (
     Velocity(),
     Velocity(linear_x=0.26),
@@ -32,7 +32,7 @@ Spoil = Callable[[DepthImage], DepthImage | None]
 
 
 class Drive:
-    """A body with a camera in a scene, which does what the gate would let through."""
+    """A body with a camera in a scene, which follows the gate's output."""
 
     def __init__(
         self,
@@ -53,7 +53,7 @@ class Drive:
     def go(
         self, ticks: int, asked: Velocity = REST, spoil: Spoil = lambda image: image
     ) -> list[str]:
-        """Drive for so many ticks; the codes of the causes after the last."""
+        """Drive for some ticks; return the codes of the causes after the last one."""
         for _ in range(ticks):
             self.tick += 1
             moves = self.memory.tracking.commanded
@@ -68,11 +68,11 @@ class Drive:
                 linear_x=asked.linear_x, angular_z=asked.angular_z, source="control",
                 boot=BOOT, tick=self.tick - 1,
             )  # fmt: skip
-            looked = self.tick - self.tick % 5
+            basis = self.tick - self.tick % 5
             pictures = {"front": Picture(image=self.newest)} if self.newest else {}
             inputs = SafetyInputs(
                 state=now,
-                scan=scan(open_space(), looked) if looked and self.lidar else None,
+                scan=scan(open_space(), basis) if basis and self.lidar else None,
                 scan_age_ns=0,
                 command=command,
                 pictures=pictures,
@@ -97,7 +97,7 @@ def _moved(pose: Pose, moves: Velocity) -> Pose:
 
 @pytest.mark.long
 @pytest.mark.parametrize("seed", range(4))
-def test_a_thing_of_3_cm_stops_the_body_before_it(seed: int) -> None:
+def test_the_body_stops_before_an_object_of_3_cm(seed: int) -> None:
     drive = Drive(Scene(boxes=(LOW,)), eye=Eye(seed=seed))
     assert drive.go(250, AHEAD) == ["zone_ahead"]
     assert 0.03 < LOW[0] - (drive.pose.x + FRONT) < 0.16
@@ -105,7 +105,7 @@ def test_a_thing_of_3_cm_stops_the_body_before_it(seed: int) -> None:
     assert "seen by a camera" in drive.verdict.causes[0].text
 
 
-def test_a_step_down_stops_the_body_before_its_edge() -> None:
+def test_the_body_stops_before_a_step_down() -> None:
     drive = Drive(Scene(edge=0.7, drop=0.05))
     assert drive.go(250, AHEAD) == ["zone_ahead"]
     assert 0.03 < 0.7 - (drive.pose.x + FRONT) < 0.13
@@ -119,16 +119,14 @@ def test_a_hole_too_deep_to_be_measured_is_no_floor() -> None:
 
 
 @pytest.mark.parametrize(("bottom", "code"), [(0.12, ["zone_ahead"]), (0.22, [])])
-def test_what_hangs_over_the_way_counts_up_to_the_height_of_the_body(
-    bottom: float, code: list[str]
-) -> None:
+def test_an_overhang_counts_up_to_the_height_of_the_body(bottom: float, code: list[str]) -> None:
     board = (0.7, 1.0, -0.4, 0.4, bottom, bottom + 0.02)
     drive = Drive(Scene(boxes=(board,)))
     assert drive.go(150, AHEAD) == code
 
 
 @pytest.mark.long
-def test_what_has_left_the_picture_is_still_in_the_way() -> None:
+def test_an_obstacle_that_left_the_picture_still_counts() -> None:
     drive = Drive(Scene(boxes=(LOW,)))
     drive.go(250, AHEAD)
     seen = sight(SEEING, CAMERA, view_of(SEEING, CAMERA), drive.newest.quarter())  # type: ignore[union-attr]
@@ -137,8 +135,8 @@ def test_what_has_left_the_picture_is_still_in_the_way() -> None:
 
 
 @pytest.mark.long
-def test_the_body_does_not_back_into_what_it_has_seen() -> None:
-    """It turns round before the thing, and drives back to where it was."""
+def test_the_body_does_not_back_into_an_obstacle_that_it_saw() -> None:
+    """It turns around before the obstacle, and drives backwards."""
     drive = Drive(Scene(boxes=(LOW,)))
     drive.go(250, AHEAD)
     drive.go(60, BACK)
@@ -148,7 +146,7 @@ def test_the_body_does_not_back_into_what_it_has_seen() -> None:
 
 
 @pytest.mark.long
-def test_what_was_taken_away_is_gone_once_it_is_seen_through() -> None:
+def test_an_obstacle_is_forgotten_once_a_picture_shows_that_it_is_gone() -> None:
     drive = Drive(Scene(boxes=(LOW,)))
     drive.go(250, AHEAD)
     drive.go(120, BACK)
@@ -160,7 +158,7 @@ def test_what_was_taken_away_is_gone_once_it_is_seen_through() -> None:
 
 
 @pytest.mark.long
-def test_what_is_out_of_reach_is_forgotten() -> None:
+def test_an_obstacle_out_of_reach_is_forgotten() -> None:
     drive = Drive(Scene(boxes=(LOW,)))
     drive.go(250, AHEAD)
     drive.scene = Scene()
@@ -179,7 +177,7 @@ def test_an_empty_floor_has_no_obstacles(seed: int) -> None:
 
 
 @pytest.mark.parametrize(("away", "tolerance"), [(0.5, 0.0096), (1.0, 0.0142), (2.0, 0.0233)])
-def test_the_tolerance_of_heights_grows_with_the_way(away: float, tolerance: float) -> None:
+def test_the_tolerance_of_heights_grows_with_the_distance(away: float, tolerance: float) -> None:
     view, column = view_of(replace(SEEING, max_linear_speed=2.0), CAMERA), 80
     depths = view.above[:, column] / 1000.0
     row = int(np.abs(depths - away).argmin())
@@ -187,7 +185,7 @@ def test_the_tolerance_of_heights_grows_with_the_way(away: float, tolerance: flo
     assert height == pytest.approx(tolerance, rel=0.1)
 
 
-def test_one_pixel_is_noise_and_a_group_is_a_thing() -> None:
+def test_one_pixel_is_noise_and_a_group_is_an_object() -> None:
     floor = Scene().depth(CAMERA, ORIGIN) * 1000
     one, group = floor.copy(), floor.copy()
     one[200, 160] = 300
@@ -197,8 +195,8 @@ def test_one_pixel_is_noise_and_a_group_is_a_thing() -> None:
     assert sight(SEEING, CAMERA, view, image(group).quarter()).sure.any()
 
 
-def test_pixels_seen_in_one_picture_only_stop_nothing() -> None:
-    """Three alike in a row: believed only if the next picture has them too."""
+def test_a_few_pixels_in_one_picture_only_do_not_count() -> None:
+    """Three similar pixels in a row count only if the next picture has them as well."""
     floor = np.rint(Scene().depth(CAMERA, ORIGIN) * 1000)
     flash = floor.copy()
     flash[180, 160:165:2] = 350
@@ -215,8 +213,8 @@ def test_pixels_seen_in_one_picture_only_stop_nothing() -> None:
     assert drive.marks == 1
 
 
-def test_a_body_on_a_sill_takes_the_floor_for_floor() -> None:
-    """Its nose is 3 degrees up, and its IMU says so."""
+def test_for_a_body_on_a_sill_the_floor_is_no_obstacle() -> None:
+    """Its front is 3 degrees up, as its IMU measures."""
     tilt = math.radians(3)
     eye = Eye(replace(CAMERA, pitch=-tilt), errors=NO_ERRORS)
     drive = Drive(Scene(), eye=eye)
@@ -260,7 +258,7 @@ BOMB = image(np.zeros((4096, 4096))).planes[0]  # 8 MB of zeros
 
 @pytest.mark.long
 @pytest.mark.parametrize(("code", "spoil"), FAULTS.values(), ids=FAULTS)
-def test_a_camera_that_fails_closes_the_way_it_looks_until_it_is_well(
+def test_a_camera_fault_stops_motion_in_its_direction_until_it_is_over(
     code: str, spoil: Spoil
 ) -> None:
     drive = Drive(Scene())
@@ -274,17 +272,17 @@ def test_a_camera_that_fails_closes_the_way_it_looks_until_it_is_well(
     assert drive.verdict.caps == SpeedCaps()
 
 
-def test_a_camera_whose_pictures_are_often_late_stays_lost_until_they_are_not() -> None:
+def test_a_camera_with_often_late_pictures_stays_lost() -> None:
     drive = Drive(Scene())
     assert drive.go(25, spoil=lambda _: None) == ["camera_lost"]
-    for _ in range(5):  # on a machine that is too busy, each second one picture comes or two
+    for _ in range(5):  # a busy machine lets one or two pictures through each second
         assert drive.go(10) == ["camera_lost"]
         assert drive.go(25, spoil=lambda _: None) == ["camera_lost"]
     assert drive.go(45) == ["camera_lost"]
     assert drive.go(15) == []
 
 
-def test_a_camera_that_repeats_a_picture_is_found_out_as_the_body_moves() -> None:
+def test_a_repeated_picture_is_a_fault_once_the_body_moves() -> None:
     drive = Drive(Scene())
     kept = drive.newest
     assert kept
@@ -296,17 +294,17 @@ def test_a_camera_that_repeats_a_picture_is_found_out_as_the_body_moves() -> Non
     assert drive.go(10) == []
 
 
-def test_a_dark_camera_that_moves_is_not_called_frozen() -> None:
+def test_a_dark_camera_that_moves_is_not_frozen() -> None:
     drive = Drive(Scene())
     assert drive.go(50, Velocity(linear_x=-0.2), _constant(0)) == ["camera_blind"]
 
 
-def test_a_still_camera_without_noise_may_repeat_itself_while_the_body_rests() -> None:
+def test_a_camera_may_repeat_its_picture_while_the_body_rests() -> None:
     drive = Drive(Scene(), eye=Eye(errors=NO_ERRORS))
     assert drive.go(100) == []
 
 
-def test_before_the_first_picture_the_body_does_not_go_ahead() -> None:
+def test_before_the_first_picture_the_body_does_not_move_ahead() -> None:
     drive = Drive(Scene())
     fresh = Drive.__new__(Drive)
     fresh.__dict__.update(drive.__dict__, memory=SafetyMemory(), newest=None, tick=0)
@@ -314,7 +312,7 @@ def test_before_the_first_picture_the_body_does_not_go_ahead() -> None:
     assert fresh.verdict.caps == SpeedCaps(forward=0.0)
 
 
-def test_a_flood_of_pictures_is_looked_at_no_faster_than_the_camera_is() -> None:
+def test_a_flood_of_pictures_is_processed_at_most_at_twice_the_cameras_rate() -> None:
     drive = Drive(Scene())
     before = drive.memory.field.cameras.pictures
     for _ in range(50):
@@ -323,13 +321,13 @@ def test_a_flood_of_pictures_is_looked_at_no_faster_than_the_camera_is() -> None
     assert drive.memory.field.cameras.pictures - before <= 18
 
 
-def test_a_body_without_a_lidar_goes_by_its_camera() -> None:
+def test_without_a_lidar_the_camera_stops_the_body() -> None:
     body = replace(SEEING, lidar=None)
     drive = Drive(Scene(boxes=(LOW,)), body=body, lidar=False)
     assert drive.go(250, AHEAD) == ["zone_ahead"]
 
 
-def test_without_cameras_in_its_file_a_body_looks_at_no_picture() -> None:
+def test_without_depth_cameras_no_picture_is_processed() -> None:
     body = replace(SEEING, cameras=(replace(CAMERA, depth=False),))
     drive = Drive(Scene(boxes=(LOW,)), body=body)
     assert drive.go(50, AHEAD) == []
@@ -340,17 +338,17 @@ def test_without_cameras_in_its_file_a_body_looks_at_no_picture() -> None:
     ("yaw", "ways"),
     [(0.0, {"forward"}), (math.pi, {"backward"}), (math.pi / 4, {"forward", "left"})],
 )
-def test_a_camera_should_see_what_is_on_its_side(yaw: float, ways: set[str]) -> None:
+def test_the_directions_that_a_camera_should_see(yaw: float, ways: set[str]) -> None:
     assert directions(replace(CAMERA, yaw=yaw)) == ways
 
 
 @pytest.mark.long
-def test_random_pictures_are_borne() -> None:
+def test_random_pictures_raise_no_error() -> None:
     drive, random = Drive(Scene()), np.random.default_rng(5)
 
     def noise(seen: DepthImage) -> DepthImage:
-        most = int(random.choice((300, 2000, 65536)))
-        pixels = random.integers(0, most, (240, 320))
+        high = int(random.choice((300, 2000, 65536)))
+        pixels = random.integers(0, high, (240, 320))
         pixels[random.random(pixels.shape) < random.random()] = 0
         return image(pixels, seen.tick)
 
@@ -362,8 +360,8 @@ def test_random_pictures_are_borne() -> None:
 
 
 @pytest.mark.long
-def test_cameras_of_all_kinds_and_places_are_borne() -> None:
-    """On the floor, over the body, looking up, back and down, with lenses that bend all."""
+def test_extreme_cameras_and_mountings_raise_no_error() -> None:
+    """On the floor or above the body, looking up, back or down, with extreme distortion."""
     random = np.random.default_rng(3)
     for number in range(60):
         camera = replace(
@@ -389,15 +387,14 @@ def test_cameras_of_all_kinds_and_places_are_borne() -> None:
 
 
 @pytest.mark.long
-def test_a_camera_turned_upright_sees_the_same() -> None:
+def test_a_camera_rolled_by_90_degrees_sees_the_same() -> None:
     camera = replace(CAMERA, roll=math.pi / 2, width=240, height=320, intrinsics=None)
     body = replace(SEEING, cameras=(camera,))
     drive = Drive(Scene(boxes=(LOW,)), eye=Eye(camera), body=body)
     assert drive.go(250, AHEAD) == ["zone_ahead"]
 
 
-def test_a_distorted_camera_sees_a_thing_where_it_is() -> None:
-    """Its points go back to the pixels that they came from."""
+def test_distortion_is_part_of_the_rays() -> None:
     camera = replace(CAMERA, distortion=(-0.05, 0.01, 0.001, -0.001, 0.0))
     body = replace(SEEING, cameras=(camera,))
     view, plain = view_of(body, camera), view_of(SEEING, CAMERA)

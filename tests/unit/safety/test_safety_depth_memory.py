@@ -1,4 +1,4 @@
-"""What safety remembers of depth pictures between which the body drives far."""
+"""Remembered obstacles of depth pictures between which the body moves far."""
 
 import pytest
 from msgspec.structs import replace
@@ -18,8 +18,8 @@ BESIDE = Scene(room=20.0, boxes=((0.95, 1.05, 0.35, 0.45, 0.0, 0.1),))
 
 
 @pytest.mark.parametrize(("metres", "kept"), [(0.9, True), (1.8, False)])
-def test_a_fast_body_remembers_what_has_left_the_picture(metres: float, kept: bool) -> None:
-    """Unless its odometry has jumped by more than the body can drive."""
+def test_a_fast_body_remembers_obstacles_that_left_the_picture(metres: float, kept: bool) -> None:
+    """It forgets them if the odometry jumps by more than the body can drive."""
     eye, cameras, history = Eye(SLOW, errors=NO_ERRORS), Cameras(), PoseHistory()
     for number, x in enumerate((0.0, metres), 1):
         pose = Pose(x=x, y=0.0, yaw=0.0)
@@ -33,8 +33,8 @@ def test_a_fast_body_remembers_what_has_left_the_picture(metres: float, kept: bo
 
 
 @pytest.mark.parametrize("missing", ["forgotten", "left out"])
-def test_a_picture_from_a_place_that_is_not_known_shows_nothing(missing: str) -> None:
-    """The camera's process was stopped for seconds, or safety got no states for a while."""
+def test_a_picture_with_an_unknown_pose_is_ignored(missing: str) -> None:
+    """The camera's process hung for seconds, or safety received no states for a while."""
     ticks = range(1, 180) if missing == "forgotten" else (1, 30)
     history = PoseHistory()
     for tick in ticks:

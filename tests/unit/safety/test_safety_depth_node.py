@@ -1,4 +1,4 @@
-"""Safety on the bus with a depth camera: pictures, floods, garbage, and what is counted."""
+"""Safety on the bus with a depth camera: pictures, floods, garbage and counters."""
 
 import random
 
@@ -28,13 +28,13 @@ from tests.unit.safety.depth_scene import CAMERA, SEEING, Eye, Scene, image
 
 ORIGIN = Pose(x=0.0, y=0.0, yaw=0.0)
 SCRIPT = replace(DRIVING, commander="script")  # the brain need not run
-MAST = replace(CAMERA, x=-0.2, z=0.2, pitch=0.3)  # sees what is right before the body
+MAST = replace(CAMERA, x=-0.2, z=0.2, pitch=0.3)  # sees the floor right ahead of the body
 LOOKING = replace(SEEING, cameras=(MAST,), body_height=0.2)
 NEAR = Scene(boxes=((0.13, 0.4, -0.2, 0.2, 0.0, 0.1),))
 
 
 class Watch(NodeBench):
-    """Safety with a body that has a camera, in a scene."""
+    """Safety with a body and its camera in a scene."""
 
     def __init__(self, description: BodyDescription = LOOKING, scene: Scene | None = None) -> None:
         super().__init__(safety.run)
@@ -43,7 +43,7 @@ class Watch(NodeBench):
         self.verdict = SafetyState(verdict="stop")
 
     def picture(self, name: str = "front", **changes: object) -> bytes:
-        """Publish what the camera sees now; return the payload."""
+        """Publish the camera's present picture; return the payload."""
         seen = self.eye.picture(self.scene, ORIGIN, self.tick)
         return self.publish(replace(seen, **changes), name)
 
@@ -54,7 +54,7 @@ class Watch(NodeBench):
         return payload
 
     async def go(self, ticks: int, *, pictures: bool = True) -> SafetyState:
-        """So many ticks, a scan and a picture in each fifth; the last verdict."""
+        """Run some ticks, with a scan and a picture every 5 ticks; return the last verdict."""
         if not self.tick:
             self.send(BODY, body(self.description))
         for _ in range(ticks):
@@ -73,7 +73,7 @@ def codes(verdict: SafetyState) -> list[str]:
     return [cause.code for cause in verdict.causes]
 
 
-async def test_a_picture_is_judged_as_it_comes() -> None:
+async def test_a_picture_is_judged_at_once() -> None:
     async with Watch() as watch:
         assert codes(await watch.go(24)) == []
         watch.scene = NEAR
@@ -95,7 +95,7 @@ async def test_a_picture_that_overtakes_the_state_of_its_tick_waits_for_it() -> 
         assert codes(watch.sent(SAFETY)[-1]) == ["zone_ahead"]
 
 
-async def test_a_camera_that_falls_silent_is_missed_within_half_a_second() -> None:
+async def test_a_silent_camera_is_reported_within_half_a_second() -> None:
     async with Watch() as watch:
         await watch.go(25)
         verdict = await watch.go(14, pictures=False)
@@ -105,7 +105,7 @@ async def test_a_camera_that_falls_silent_is_missed_within_half_a_second() -> No
         assert codes(await watch.go(55)) == []
 
 
-async def test_pictures_of_another_start_do_not_count() -> None:
+async def test_pictures_of_another_boot_do_not_count() -> None:
     async with Watch() as watch:
         await watch.go(25)
         for _ in range(15):
@@ -115,7 +115,7 @@ async def test_pictures_of_another_start_do_not_count() -> None:
     assert codes(verdict) == ["camera_lost"]
 
 
-async def test_a_body_without_cameras_listens_to_no_picture() -> None:
+async def test_without_cameras_safety_does_not_subscribe_to_pictures() -> None:
     async with Watch(WAFFLE, NEAR) as watch:
         verdict = await watch.go(25)
         assert DEPTH.at("*") not in watch.bus.listens
@@ -124,7 +124,7 @@ async def test_a_body_without_cameras_listens_to_no_picture() -> None:
 
 @pytest.mark.long
 @pytest.mark.parametrize("changes", [{"basis": 999}, {"tick": 999}])
-async def test_pictures_of_the_future_keep_none_out(changes: dict[str, int]) -> None:
+async def test_pictures_of_the_future_do_not_block_present_ones(changes: dict[str, int]) -> None:
     async with Watch() as watch:
         await watch.go(25)
         for _ in range(25):
@@ -148,7 +148,7 @@ async def test_a_flood_of_old_and_repeated_pictures_is_counted() -> None:
 
 
 @pytest.mark.long
-async def test_pictures_of_cameras_that_the_body_has_not_are_counted() -> None:
+async def test_pictures_of_unknown_cameras_are_counted() -> None:
     async with Watch() as watch:
         await watch.go(25)
         for number in range(100):
@@ -158,8 +158,8 @@ async def test_pictures_of_cameras_that_the_body_has_not_are_counted() -> None:
 
 
 @pytest.mark.long
-async def test_garbage_on_its_key_closes_the_way_and_ends_no_process() -> None:
-    """Bytes at random, damaged pictures, wrong sizes; then it sees again."""
+async def test_garbage_on_the_camera_key_stops_motion_but_not_the_process() -> None:
+    """Random bytes, damaged pictures and wrong sizes; good pictures end the fault."""
     chance = random.Random(7)
     async with Watch() as watch:
         await watch.go(25)
@@ -186,7 +186,7 @@ async def test_garbage_on_its_key_closes_the_way_and_ends_no_process() -> None:
         assert codes(await watch.go(15)) == []
 
 
-async def test_a_driver_that_restarts_forgets_what_was_seen() -> None:
+async def test_a_restart_of_the_driver_forgets_obstacles() -> None:
     async with Watch(scene=NEAR) as watch:
         assert codes(await watch.go(25)) == ["zone_ahead"]
         watch.send(BODY, body(LOOKING, boot=BOOT + 1))
@@ -198,7 +198,7 @@ async def test_a_driver_that_restarts_forgets_what_was_seen() -> None:
     assert "camera_lost" in found
 
 
-async def test_a_body_that_gets_other_cameras_is_judged_by_them() -> None:
+async def test_a_new_description_replaces_the_cameras() -> None:
     async with Watch() as watch:
         await watch.go(25)
         rear = replace(MAST, name="rear", yaw=3.1416, x=0.0)

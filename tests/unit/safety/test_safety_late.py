@@ -1,4 +1,4 @@
-"""Data that come late: named, and the body slowed or stopped within a second, on a fake clock."""
+"""Late data are reported, and slow or stop the body within a second, on a fake clock."""
 
 import random
 
@@ -18,33 +18,33 @@ STEP, TURN_STEP = 0.02, 0.06  # of speed in a tick
 
 
 class Follower(Patrol):
-    """A body that does what it was told `delay` ticks ago, and is somewhat noisy."""
+    """A body that follows commands `delay` ticks late, with some noise."""
 
     def __init__(self, delay: int = 3) -> None:
         super().__init__(QUICK)
         self.delay, self.noise = delay, 0.004
-        self.told = [REST] * 100
+        self.commanded = [REST] * 100
         self.go(40)
         self.chance = random.Random(1)
 
     def drive(
         self, ticks: int, to: Velocity, gate: GateStatus = DRIVING, age_ms: float = 10.0
     ) -> list[str]:
-        """Ramp to a speed and keep it; every cause that came up."""
+        """Ramp to a speed and keep it; return the codes of all causes."""
         found: list[str] = []
         for _ in range(ticks):
-            now, to = self.told[-1], clamp(to, limits_of(QUICK), self.verdict.caps)
-            told = Velocity(
+            now, to = self.commanded[-1], clamp(to, limits_of(QUICK), self.verdict.caps)
+            commanded = Velocity(
                 linear_x=_towards(now.linear_x, to.linear_x, STEP),
                 angular_z=_towards(now.angular_z, to.angular_z, TURN_STEP),
             )
-            self.told.append(told)
-            then = self.told[-1 - self.delay]
+            self.commanded.append(commanded)
+            then = self.commanded[-1 - self.delay]
             moves = Velocity(
                 linear_x=then.linear_x + self.chance.gauss(0.0, self.noise),
                 angular_z=then.angular_z + self.chance.gauss(0.0, 4 * self.noise),
             )
-            found += self.go(told=told, moves=moves, gate=gate, age_ms=age_ms)
+            found += self.go(commanded=commanded, moves=moves, gate=gate, age_ms=age_ms)
         return list(dict.fromkeys(found))
 
     @property
@@ -59,7 +59,7 @@ def _towards(now: float, to: float, step: float) -> float:
 FAST, TURN = Velocity(linear_x=0.26), Velocity(linear_x=0.1, angular_z=1.0)
 
 
-def test_a_lidar_whose_stamps_show_that_it_is_100_ms_late_is_named_and_halves_the_speed() -> None:
+def test_a_lidar_with_stamps_100_ms_late_halves_the_speed() -> None:
     patrol = Patrol(QUICK)
     patrol.go(50)
     assert patrol.ticks_until("lidar_late", 50, scan_late_ms=100.0) == 10
@@ -70,7 +70,7 @@ def test_a_lidar_whose_stamps_show_that_it_is_100_ms_late_is_named_and_halves_th
     assert patrol.go() == []
 
 
-def test_a_body_whose_stamps_show_that_it_is_100_ms_late_is_named_and_halves_the_speed() -> None:
+def test_a_body_with_stamps_100_ms_late_halves_the_speed() -> None:
     patrol = Patrol(QUICK)
     patrol.go(50)
     assert patrol.ticks_until("body_late", 50, late_ms=100.0) == 10
@@ -79,7 +79,7 @@ def test_a_body_whose_stamps_show_that_it_is_100_ms_late_is_named_and_halves_the
 
 
 @pytest.mark.parametrize("which", ["late_ms", "scan_late_ms"])
-def test_what_is_later_than_the_reaction_time_stops_it(which: str) -> None:
+def test_data_later_than_the_reaction_time_stop_the_body(which: str) -> None:
     patrol = Patrol(QUICK)
     patrol.go(50)
     patrol.go(9, **{which: 240.0})  # type: ignore[arg-type]
@@ -89,30 +89,30 @@ def test_what_is_later_than_the_reaction_time_stops_it(which: str) -> None:
     assert not patrol.verdict.causes[0].latching
 
 
-def test_what_a_busy_machine_makes_late_is_left_alone() -> None:
+def test_the_delay_of_a_busy_machine_is_no_cause() -> None:
     patrol = Patrol(QUICK)
     assert patrol.go(100, late_ms=40.0, scan_late_ms=40.0) == []
 
 
-def test_a_line_without_stamps_that_is_100_ms_late_is_named_within_a_second_of_moving() -> None:
+def test_without_stamps_a_line_100_ms_late_is_found_within_a_second_of_motion() -> None:
     for to in (FAST, TURN):
         body = Follower(delay=8)
         assert body.drive(50, to) == ["body_late"]
         assert body.texts == ["the body's data are late, by 100 ms; half speed"]
 
 
-def test_one_that_becomes_late_on_the_way_is_named_within_a_second_of_a_change_of_speed() -> None:
+def test_a_line_that_becomes_late_is_found_within_a_second_of_a_change_of_speed() -> None:
     body = Follower()
     assert body.drive(100, FAST) == []
     body.delay = 8
-    assert body.drive(100, FAST) == []  # who goes on alike shows nothing
+    assert body.drive(100, FAST) == []  # a constant speed shows no delay
     assert body.drive(50, TURN) == ["body_late"]
     body.delay = 3
     body.drive(50, FAST)
     assert body.drive(50, TURN) == []
 
 
-def test_one_that_becomes_late_while_it_goes_on_alike_is_doubted_for_its_silence() -> None:
+def test_at_constant_speed_a_silence_casts_doubt() -> None:
     body = Follower()
     assert body.drive(100, FAST) == []
     for age_ms in (30.0, 50.0, 70.0, 90.0):
@@ -123,7 +123,7 @@ def test_one_that_becomes_late_while_it_goes_on_alike_is_doubted_for_its_silence
     assert body.texts == ["the body's data are late, by 100 ms; half speed"]
 
 
-def test_what_was_measured_before_a_silence_says_nothing_of_the_time_after_it() -> None:
+def test_speeds_measured_before_a_silence_are_forgotten() -> None:
     body = Follower()
     body.drive(60, REST)
     assert body.drive(25, FAST) == []
@@ -135,7 +135,7 @@ def test_what_was_measured_before_a_silence_says_nothing_of_the_time_after_it() 
     assert body.texts == ["the body's data are late, by 100 ms; half speed"]
 
 
-def test_one_that_is_slower_than_that_is_doubted_for_five_seconds() -> None:
+def test_the_doubt_about_a_body_below_half_speed_lasts_5_s() -> None:
     body, slow = Follower(), Velocity(linear_x=0.1)
     assert body.drive(100, slow) == []
     body.drive(1, slow, age_ms=90.0)
@@ -150,7 +150,7 @@ def test_the_silence_of_a_body_with_a_clock_casts_no_doubt() -> None:
     assert patrol.go(1, age_ms=90.0) == ["body_late"]
 
 
-def test_a_body_that_was_only_silent_is_believed_again_as_soon_as_it_is_seen_to_follow() -> None:
+def test_the_doubt_ends_once_the_speeds_show_no_delay() -> None:
     body = Follower()
     assert body.drive(100, FAST) == []
     for age_ms in (30.0, 50.0, 70.0, 90.0):
@@ -169,7 +169,7 @@ def test_jitter_of_a_line_casts_no_doubt() -> None:
 @pytest.mark.long
 @pytest.mark.parametrize("changes", [25, pytest.param(100, marks=pytest.mark.qa)])
 @pytest.mark.parametrize("delay", [0, 1, 3, 5])
-def test_a_body_that_follows_as_it_always_does_is_not_late(delay: int, changes: int) -> None:
+def test_a_body_with_a_normal_delay_is_not_late(delay: int, changes: int) -> None:
     body, chance = Follower(delay), random.Random(2)
     for _ in range(changes):
         to = Velocity(linear_x=chance.uniform(-0.26, 0.26), angular_z=chance.uniform(-1.0, 1.0))
@@ -177,7 +177,7 @@ def test_a_body_that_follows_as_it_always_does_is_not_late(delay: int, changes: 
         assert body.drive(chance.randint(5, 80), to) == []
 
 
-def test_it_is_forgotten_at_rest_so_that_a_line_that_was_mended_is_tried_again() -> None:
+def test_the_delay_is_forgotten_at_rest() -> None:
     body = Follower(delay=8)
     assert body.drive(50, FAST) == ["body_late"]
     body.drive(50, REST)
@@ -189,8 +189,8 @@ def test_it_is_forgotten_at_rest_so_that_a_line_that_was_mended_is_tried_again()
 
 @pytest.mark.long
 @pytest.mark.parametrize("delay", [10, 15, 20, 25])
-def test_a_line_that_is_late_however_much_makes_no_runaway(delay: int) -> None:
-    """A stop from full speed, whose reports still tell of motion when it is over."""
+def test_a_late_line_causes_no_runaway(delay: int) -> None:
+    """After a stop from full speed, late states still report motion."""
     body = Follower(delay)
     for _ in range(5):
         found = body.drive(60, Velocity(linear_x=0.26))

@@ -1,4 +1,4 @@
-"""A lidar that does not look all round: what it has just seen, and where the body has stood."""
+"""A lidar without a full circle: free space by past scans, and by the body's own path."""
 
 import math
 
@@ -15,7 +15,7 @@ from gigabrain_zenoh.safety import blind_spots
 from gigabrain_zenoh.safety.zones import Motion, ProtectiveField
 from gigabrain_zenoh.testing.samples import DRIVING, LIDAR, WAFFLE, scan, state
 
-BEAMS = 271  # a degree apart, from right behind on the right to right behind on the left
+BEAMS = 271  # 1 degree apart, from -135 to 135 degrees
 HALF = math.radians(135)
 STEP_S = 0.1
 REST = Velocity()
@@ -40,7 +40,7 @@ def sight(pose: Pose, posts: tuple[Post, ...]) -> NDArray[np.float64]:
 
 
 class Walker:
-    """A body in a room of posts, scanning ten times a second; safety's field after each scan."""
+    """A body in a room of posts, with 10 scans a second and safety's field."""
 
     def __init__(self, *posts: Post) -> None:
         self.posts, self.pose, self.tick = posts, Pose(x=0.0, y=0.0, yaw=0.0), 0
@@ -77,67 +77,67 @@ class Walker:
 
     @property
     def back(self) -> float | None:
-        """The speed that safety allows backwards [m/s]; None where nothing limits it."""
+        """Return the speed cap backwards [m/s]; None without one."""
         return self.field.caps(BODY).backward
 
     @property
     def behind(self) -> float | None:
-        """Return the free distance behind the body [m]; None where nothing is in the way."""
+        """Return the free distance behind the body [m]; None without an obstacle."""
         return self.field.free["backward"]
 
 
-def test_it_may_go_back_the_way_it_has_come_and_at_first_nowhere() -> None:
+def test_the_body_may_back_along_its_path_but_not_at_first() -> None:
     walker = Walker()
-    assert walker.back == 0.0  # nobody has looked there
+    assert walker.back == 0.0  # not seen yet
     walker.go(3.0, AHEAD)
     assert walker.behind is not None
-    assert 0.3 < walker.behind <= 0.36  # more is not asked for: it may creep, not drive
+    assert 0.3 < walker.behind <= 0.36  # PROBE_MAX_M: it may creep, not drive
     assert walker.back is None or walker.back > 0.1
 
 
 @pytest.mark.long
 @pytest.mark.parametrize("speed", [0.03, 0.1, 0.26])
-def test_it_comes_back_to_where_it_began_and_no_farther(speed: float) -> None:
+def test_the_body_backs_to_its_start_and_no_farther(speed: float) -> None:
     walker = Walker().go(0.5 / speed, Velocity(linear_x=speed)).wait(0.3)
     for _ in range(600):
         if walker.back == 0.0:
             break
         walker.go(0.1, replace(BACK, linear_x=-speed))
-    assert -0.05 <= walker.pose.x <= 0.3  # it stops in time before what nobody has seen
+    assert -0.05 <= walker.pose.x <= 0.3  # it stops before unseen space
 
 
 @pytest.mark.long
-def test_a_way_back_is_forgotten_after_half_a_minute() -> None:
+def test_the_path_is_forgotten_after_half_a_minute() -> None:
     walker = Walker().go(3.0, AHEAD)
     assert walker.wait(25.0).back != 0.0
     assert walker.wait(6.0).back == 0.0
 
 
 @pytest.mark.long
-def test_turning_to_and_fro_does_not_make_it_forget() -> None:
+def test_turning_to_and_fro_keeps_the_past_views() -> None:
     walker = Walker().go(3.0, AHEAD)
     for _ in range(8):
         walker.go(0.5, ROUND).go(1.0, replace(ROUND, angular_z=-1.0)).go(0.5, ROUND)
     assert walker.wait(0.2).behind == pytest.approx(0.35, abs=0.05)
 
 
-def test_who_has_come_there_meanwhile_and_was_seen_stands_in_the_way() -> None:
+def test_an_obstacle_seen_later_on_the_path_counts() -> None:
     walker = Walker().go(3.0, AHEAD)
-    walker.go(1.6, ROUND)  # now it sees where it has come from, on its right
-    walker.posts = ((0.2, 0.0, 0.1),)  # 0.1 m behind the body as it stood
+    walker.go(1.6, ROUND)  # now it sees its path, on its right
+    walker.posts = ((0.2, 0.0, 0.1),)  # 0.1 m behind the body before the turn
     walker.wait(0.2).go(1.6, replace(ROUND, angular_z=-1.0)).wait(0.2)
     assert walker.pose.yaw == pytest.approx(0.0, abs=1e-6)
-    assert not np.isfinite(sight(walker.pose, walker.posts)).any()  # and it sees it no more
+    assert not np.isfinite(sight(walker.pose, walker.posts)).any()  # out of sight
     assert walker.back == 0.0
 
 
-def test_when_the_odometry_jumps_nothing_is_known_behind() -> None:
+def test_a_jump_of_the_odometry_forgets_the_path() -> None:
     walker = Walker().go(3.0, AHEAD)
     walker.pose = replace(walker.pose, x=walker.pose.x + 0.6)
     assert walker.wait(0.2).back == 0.0
 
 
-def test_while_the_gate_is_shut_somebody_may_carry_it_away() -> None:
+def test_the_path_is_forgotten_while_the_gate_is_not_enabled() -> None:
     walker = Walker().go(3.0, AHEAD)
     walker.gate = GateStatus(mode="stopping")
     walker.wait(0.2)
@@ -145,7 +145,7 @@ def test_while_the_gate_is_shut_somebody_may_carry_it_away() -> None:
     assert walker.wait(0.2).back == 0.0
 
 
-def test_a_scan_whose_pose_is_not_known_any_more_counts_where_the_body_is_now() -> None:
+def test_a_scan_without_a_known_pose_counts_at_the_present_one() -> None:
     walker = Walker()
     walker.history = PoseHistory()
     late = scan(sight(walker.pose, ()), 1, angle_min=-HALF, angle_increment=2 * HALF / 270)
@@ -153,7 +153,7 @@ def test_a_scan_whose_pose_is_not_known_any_more_counts_where_the_body_is_now() 
     assert walker.field.past[-1].pose == walker.pose
 
 
-def test_whoever_looks_all_round_remembers_nothing() -> None:
+def test_a_lidar_with_a_full_circle_remembers_no_views() -> None:
     body, now = WAFFLE, replace(state(5), gate=DRIVING)
     motion = Motion(measured=REST, commanded=REST, requested=REST)
     values = np.full(360, 2.0)
@@ -165,15 +165,15 @@ def test_whoever_looks_all_round_remembers_nothing() -> None:
 
 
 def past(*scans: tuple[Pose, LaserScan]) -> blind_spots.PastViews:
-    """These looks, and one from the origin that looks at nothing that is asked for."""
+    """Return views of these scans, and an empty one from the origin."""
     nothing = scan(np.full(2, np.nan), 99, angle_min=0.0, angle_increment=0.01)
     here = Pose(x=0.0, y=0.0, yaw=0.0), nothing
-    return tuple(blind_spots.PastView(*one) for one in (*scans, here))
+    return tuple(blind_spots.PastView(*view) for view in (*scans, here))
 
 
 def known(points: list[tuple[float, float]], *scans: tuple[Pose, LaserScan]) -> list[bool]:
     found = blind_spots.known_free(BODY, LIDAR, 0.1, past(*scans), np.array(points))
-    return [bool(one) for one in found]
+    return [bool(free) for free in found]
 
 
 def seen_from(pose: Pose, *posts: Post, clockwise: bool = False) -> tuple[Pose, LaserScan]:
@@ -184,7 +184,7 @@ def seen_from(pose: Pose, *posts: Post, clockwise: bool = False) -> tuple[Pose, 
 
 
 @pytest.mark.parametrize("clockwise", [False, True])
-def test_what_is_hidden_behind_something_or_by_its_side_is_not_known(clockwise: bool) -> None:
+def test_points_at_or_behind_an_obstacle_are_not_free(clockwise: bool) -> None:
     look = seen_from(Pose(x=-2.0, y=0.0, yaw=0.0), (-0.5, 0.0, 0.1), clockwise=clockwise)
     points = [(-1.0, 0.0), (-0.62, 0.0), (-0.2, 0.0), (-0.2, 1.0), (-2.8, 0.0), (-1.9, 0.05)]
     assert known(points, look) == [
@@ -193,17 +193,17 @@ def test_what_is_hidden_behind_something_or_by_its_side_is_not_known(clockwise: 
         False,  # behind it
         True,
         False,  # behind the lidar
-        True,  # where the body has stood
+        True,  # the body stood there
     ]
 
 
 @pytest.mark.parametrize("clockwise", [False, True])
-def test_left_and_right_are_not_taken_for_each_other(clockwise: bool) -> None:
+def test_left_and_right_are_not_mixed_up(clockwise: bool) -> None:
     look = seen_from(Pose(x=-2.0, y=0.0, yaw=0.0), (-1.0, 0.5, 0.2), clockwise=clockwise)
     assert known([(-1.0, 0.5), (-1.0, -0.5)], look) == [False, True]
 
 
-def test_the_newest_look_at_a_place_is_believed() -> None:
+def test_the_newest_scan_of_a_place_counts() -> None:
     there = Pose(x=-2.0, y=0.0, yaw=0.0)
     empty, taken = seen_from(there), seen_from(there, (-0.5, 0.0, 0.1))
     away = seen_from(Pose(x=-2.0, y=0.0, yaw=math.pi))  # it looks the other way
@@ -211,7 +211,7 @@ def test_the_newest_look_at_a_place_is_believed() -> None:
     assert known([(-0.6, 0.0)], taken, empty, away) == [True]
 
 
-def test_beams_on_the_housing_and_unknown_ones_tell_nothing() -> None:
+def test_beams_on_the_housing_and_unknown_ones_show_no_free_space() -> None:
     pose = Pose(x=-1.0, y=0.0, yaw=0.0)
     step = 2 * HALF / (BEAMS - 1)
     housing = scan(np.full(BEAMS, 0.05), 1, angle_min=-HALF, angle_increment=step)

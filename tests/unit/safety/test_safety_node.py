@@ -1,4 +1,4 @@
-"""Safety on the bus: how often it speaks, whom it waits for, and after how long it misses them."""
+"""Safety on the bus: rate of verdicts, the systems it needs, and timeouts."""
 
 import logging
 
@@ -24,7 +24,7 @@ INTENT_NOW = Intent(twist=Velocity(), behaviour="avoid", reason="because")
 
 
 class Chain(NodeBench):
-    """Safety, with all that it listens to."""
+    """Safety with all of its inputs."""
 
     def __init__(self) -> None:
         super().__init__(safety.run)
@@ -41,9 +41,9 @@ class Chain(NodeBench):
         battery: float = 100.0,
         hung: str = "",
     ) -> list[tuple[int, tuple[str, ...]]]:
-        """So many ticks with these systems alive; tick and causes of every verdict.
+        """Run some ticks with these systems alive; return tick and causes of each verdict.
 
-        The one that is `hung` goes on sending, with the newest tick, what it made of an old scan.
+        The `hung` system goes on sending messages with the newest tick, but an old basis.
         """
         old = self.seen
         for _ in range(ticks):
@@ -54,11 +54,11 @@ class Chain(NodeBench):
                 self.seen = self.tick
             basis = {name: old if name == hung else self.seen for name in ALL}
             if self.tick % 5 == 0 and "perception" in alive:
-                said = replace(WORLD_NOW, basis=basis["perception"])
-                self.send(WORLD, replace(said, boot=BOOT, tick=self.tick))
+                world = replace(WORLD_NOW, basis=basis["perception"])
+                self.send(WORLD, replace(world, boot=BOOT, tick=self.tick))
             if "decision" in alive:
-                thought = replace(INTENT_NOW, basis=basis["decision"])
-                self.send(INTENT, replace(thought, boot=BOOT, tick=self.tick))
+                intent = replace(INTENT_NOW, basis=basis["decision"])
+                self.send(INTENT, replace(intent, boot=BOOT, tick=self.tick))
             if "control" in alive:
                 command = CmdVel(linear_x=0.0, source=source, boot=BOOT, tick=self.tick)
                 self.send(CMD_VEL, replace(command, basis=basis["control"]))
@@ -71,14 +71,14 @@ async def started(chain: Chain) -> None:
     await chain.go(20)
 
 
-async def test_it_speaks_every_second_tick_and_with_every_scan() -> None:
+async def test_a_verdict_is_published_every_second_tick_and_with_every_scan() -> None:
     async with Chain() as chain:
         await started(chain)
         ticks = [tick for tick, causes in await chain.go(20) if causes == ()]
     assert ticks == [22, 24, 25, 27, 29, 30, 32, 34, 35, 37, 39, 40]
 
 
-async def test_a_verdict_rests_on_the_newest_scan_and_carries_the_newest_tick() -> None:
+async def test_a_verdict_is_based_on_the_newest_scan_and_has_the_newest_tick() -> None:
     async with Chain() as chain:
         chain.send(BODY, body())
         chain.send(STATE, state(5))
@@ -102,7 +102,7 @@ async def test_a_change_is_published_at_once() -> None:
     async with Chain() as chain:
         await started(chain)
         await chain.go(1)
-        await chain.go(111, battery=1.0)  # 13 until the median has followed, and two seconds
+        await chain.go(111, battery=1.0)  # 13 until the median follows, and two seconds
         found = await chain.go(1, battery=1.0)
     assert found == [(133, ("battery_empty",))]
 
@@ -115,28 +115,28 @@ async def test_a_knock_is_reported_for_a_while_as_a_busy_gate_may_miss_a_verdict
         await chain.go(tick - 20)
         chain.send(IMU, knock)
         found = await chain.go(20)
-    told = [since for since, causes in found if causes == ("collision",)]
+    reported = [since for since, causes in found if causes == ("collision",)]
     verdicts = [since for since, _ in found if tick < since <= tick + LATCHING_TICKS]
-    assert told == verdicts
-    assert len(told) > 5
+    assert reported == verdicts
+    assert len(reported) > 5
 
 
 @pytest.mark.parametrize(
     ("name", "missed_ms"),
     [("decision", 160), ("control", 160), ("perception", 260)],
 )
-async def test_a_silent_system_is_missed_in_time(name: str, missed_ms: int) -> None:
+async def test_a_silent_system_is_reported_in_time(name: str, missed_ms: int) -> None:
     async with Chain() as chain:
         await started(chain)
         alive = tuple(other for other in ALL if other != name)
         found = await chain.go(30, alive=alive)
     first = next(tick for tick, causes in found if causes)
-    assert (first - 20) * 20 == missed_ms  # all were heard last in tick 20
+    assert (first - 20) * 20 == missed_ms  # the last messages have tick 20
     assert found[-1] == (50, (f"{name}_silent",))
 
 
 @pytest.mark.parametrize("name", ALL)
-async def test_a_system_that_hangs_while_its_process_runs_is_missed_within_300_ms(
+async def test_a_system_that_hangs_while_its_process_runs_is_reported_within_300_ms(
     name: str,
 ) -> None:
     async with Chain() as chain:
@@ -144,12 +144,12 @@ async def test_a_system_that_hangs_while_its_process_runs_is_missed_within_300_m
         found = await chain.go(30, hung=name)
         again = await chain.go(10)
     first = next(tick for tick, causes in found if causes)
-    assert (first - 20) * 20 == 260  # the next scan comes 100 ms after the last that it answered
+    assert (first - 20) * 20 == 260  # the next scan comes 100 ms after the last answered one
     assert {causes for tick, causes in found if tick >= first} == {(f"{name}_silent",)}
     assert again[-1][1] == ()
 
 
-async def test_a_lost_scan_is_missed_in_time() -> None:
+async def test_a_lost_scan_is_reported_in_time() -> None:
     async with Chain() as chain:
         await started(chain)
         found = await chain.go(30, scans=False)
@@ -158,7 +158,7 @@ async def test_a_lost_scan_is_missed_in_time() -> None:
     assert found[-1][1] == ("scan_lost",)
 
 
-async def test_what_a_script_sends_is_no_sign_of_life_from_control() -> None:
+async def test_commands_of_a_script_do_not_count_as_control() -> None:
     async with Chain() as chain:
         await started(chain)
         found = await chain.go(30, source="script")
@@ -174,20 +174,20 @@ async def test_without_a_brain_a_script_may_drive() -> None:
     assert {causes for _, causes in driven} == {()}
 
 
-async def test_silence_is_judged_by_the_robots_clock_alone() -> None:
+async def test_silence_is_judged_by_the_robots_clock_only() -> None:
     async with Chain() as chain:
         await started(chain)
-        await chain.clock.advance(200_000_000)  # the driver was held up; its time stood still
+        await chain.clock.advance(200_000_000)  # the driver hung; its ticks stood still
         found = await chain.go(3, scans=False)
-    assert {causes for _, causes in found} <= {()}  # 260 ms after the scan came, 60 ms by the tick
+    assert {causes for _, causes in found} <= {()}  # 260 ms by arrival, 60 ms by the tick
 
 
-async def test_a_driver_that_starts_anew_is_judged_afresh() -> None:
+async def test_a_restart_of_the_driver_resets_safety() -> None:
     async with Chain() as chain:
         await started(chain)
         for tick in (1, 2, 3):
             chain.send(STATE, state(tick, boot=8))
-        assert chain.sent(SAFETY) == []  # whose body?
+        assert chain.sent(SAFETY) == []  # the body is not known yet
         chain.send(BODY, body(boot=8))
         chain.send(STATE, state(4, boot=8))
         (verdict,) = chain.sent(SAFETY)
@@ -201,7 +201,7 @@ async def test_a_cause_is_logged_once_when_it_begins_and_once_when_it_ends(
     caplog.set_level(logging.INFO, "gigabrain_zenoh.safety")
     async with Chain() as chain:
         chain.send(BODY, body())
-        await chain.go(20, alive=("decision",), gate=NOBODY)  # while all is starting: not a word
+        await chain.go(20, alive=("decision",), gate=NOBODY)  # nothing is logged during the start
         await chain.go(20, gate=NOBODY)
         assert caplog.messages == []
         await chain.go(20)
@@ -214,7 +214,7 @@ async def test_a_cause_is_logged_once_when_it_begins_and_once_when_it_ends(
 
 
 @pytest.mark.parametrize("key", ["robot/imu", "robot/map", "robot/pose", "robot/log"])
-async def test_what_is_bad_on_a_key_that_nobody_else_reads_is_counted(key: str) -> None:
+async def test_invalid_messages_on_keys_without_another_reader_are_counted(key: str) -> None:
     async with Chain() as chain:
         await started(chain)
         chain.network.deliver(key, b"\xc1garbage")

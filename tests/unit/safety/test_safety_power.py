@@ -1,4 +1,4 @@
-"""Battery and motors: how low, how hot, for how long, and what if nothing is measured any more."""
+"""Battery and motors: low charge, heat, sags and missing values."""
 
 import pytest
 
@@ -45,7 +45,7 @@ def test_an_empty_battery_stops_the_body_after_two_seconds(
 
 
 @pytest.mark.parametrize("ticks", [10, 12])
-def test_sags_of_a_starting_motor_do_nothing_however_often(ticks: int) -> None:
+def test_short_sags_of_a_starting_motor_are_ignored(ticks: int) -> None:
     patrol = Patrol()
     for _ in range(20):
         assert patrol.go(ticks, battery=charge(1.0, 6.0)) == []
@@ -53,7 +53,7 @@ def test_sags_of_a_starting_motor_do_nothing_however_often(ticks: int) -> None:
         assert patrol.warnings == []
 
 
-def test_a_long_sag_does_nothing_either_before_two_seconds_are_over() -> None:
+def test_a_sag_of_less_than_two_seconds_is_ignored() -> None:
     patrol = Patrol()
     patrol.go(50, battery=charge(60.0))
     assert patrol.go(110, battery=charge(1.0)) == []
@@ -61,7 +61,7 @@ def test_a_long_sag_does_nothing_either_before_two_seconds_are_over() -> None:
     assert patrol.warnings == []
 
 
-def test_a_spike_upwards_does_not_hide_an_empty_battery() -> None:
+def test_spikes_upwards_do_not_hide_an_empty_battery() -> None:
     patrol = Patrol()
     for _ in range(12):
         patrol.go(15, battery=charge(3.0))
@@ -69,7 +69,7 @@ def test_a_spike_upwards_does_not_hide_an_empty_battery() -> None:
     assert "battery_empty" in patrol.codes
 
 
-def test_a_battery_on_the_edge_does_not_flicker() -> None:
+def test_a_battery_near_a_threshold_does_not_flicker() -> None:
     patrol = Patrol()
     patrol.go(100, battery=charge(15.0))
     patrol.go(300, battery=charge(16.5))
@@ -86,11 +86,11 @@ def test_a_battery_that_is_no_longer_measured_stops_the_body_after_two_seconds()
     assert patrol.go(battery=charge(60.0)) == []
 
 
-def test_a_battery_without_a_voltage_counts_as_not_measured_where_it_had_one() -> None:
+def test_a_battery_that_loses_its_voltage_counts_as_not_measured() -> None:
     patrol = Patrol()
     patrol.go(5, battery=charge(60.0))
     assert patrol.go(100, battery=charge(60.0, voltage=0.0)) == ["battery_unknown"]
-    other = Patrol()  # it reports percentages alone
+    other = Patrol()  # it reports percentages only
     assert other.go(200, battery=charge(60.0, voltage=0.0)) == []
 
 
@@ -113,7 +113,7 @@ def test_a_hot_motor_stops_the_body_after_half_a_second(degrees: float, stopped:
     assert [cause.latching for cause in patrol.verdict.causes] == [True] * len(stopped)
 
 
-def test_a_spike_of_temperature_does_nothing() -> None:
+def test_a_spike_of_temperature_is_ignored() -> None:
     patrol = Patrol()
     for _ in range(10):
         assert patrol.go(10, joints=motors(80.0)) == []
@@ -121,20 +121,20 @@ def test_a_spike_of_temperature_does_nothing() -> None:
 
 
 @pytest.mark.parametrize("reading", [None, -60.0, 400.0])
-def test_a_motor_that_says_nothing_sensible_any_more_stops_the_body(reading: float | None) -> None:
+def test_a_motor_without_plausible_temperatures_stops_the_body(reading: float | None) -> None:
     patrol = Patrol()
     patrol.go(5, joints=motors(30.0, 30.0))
     assert patrol.go(99, joints=motors(30.0, reading)) == []
     assert patrol.go(joints=motors(30.0, reading)) == ["motor_unknown"]
 
 
-def test_a_body_that_measures_neither_is_not_stopped_for_it() -> None:
+def test_a_body_without_battery_and_temperatures_is_not_stopped() -> None:
     patrol = Patrol()
     assert patrol.go(300, joints=motors(None)) == []
     assert patrol.verdict.verdict == "ok"
 
 
-def test_one_sample_after_a_long_gap_does_not_count_for_all_of_it() -> None:
+def test_one_state_after_a_long_gap_does_not_count_for_the_whole_gap() -> None:
     patrol = Patrol()
     patrol.go(joints=motors(30.0))
     patrol.tick += 1000
@@ -142,7 +142,7 @@ def test_one_sample_after_a_long_gap_does_not_count_for_all_of_it() -> None:
     assert "motor_hot" not in patrol.go(joints=motors(90.0))
 
 
-def test_one_state_that_measures_something_is_no_proof_that_the_body_does() -> None:
+def test_a_value_in_a_single_state_does_not_count_as_measured() -> None:
     patrol = Patrol()
     patrol.go(10, joints=motors(None))
     for _ in range(3):

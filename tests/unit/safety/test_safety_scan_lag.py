@@ -1,4 +1,4 @@
-"""A lidar without stamps that comes late: seen by how its scans turn, on a fake clock."""
+"""A late lidar without stamps is found by the turns of its scans, on a fake clock."""
 
 import math
 import random
@@ -31,12 +31,12 @@ def room(pose: Pose) -> NDArray[np.float64]:
 
 
 def silo(_: Pose) -> NDArray[np.float64]:
-    """Round, and the same from everywhere."""
+    """Return the ranges in a round room, equal in all directions."""
     return np.full(360, 2.0)
 
 
 class Robot:
-    """Drives as it is told; its lidar's scans come `delay` ticks after they were measured."""
+    """A robot that follows commands; its scans arrive `delay` ticks late."""
 
     def __init__(self, delay: int, body: BodyDescription = BODY) -> None:
         self.body, self.delay = body, delay
@@ -51,7 +51,7 @@ class Robot:
         self.drive(60, 0.0)
 
     def drive(self, ticks: int, turning: float, speed: float = 0.0) -> list[str]:
-        """So many ticks, turning like that soon; what was found to be late."""
+        """Ramp to a rate of turn [rad/s] and keep it; return the codes of all causes."""
         found: list[str] = []
         for _ in range(ticks):
             self.tick += 1
@@ -81,15 +81,15 @@ class Robot:
         )
 
 
-def test_a_lidar_without_stamps_that_is_100_ms_late_is_named_within_a_second_of_a_turn() -> None:
+def test_a_lidar_100_ms_late_is_found_within_a_second_of_a_turn() -> None:
     for delay in (5, 6):
         robot = Robot(delay)
         assert robot.drive(50, 1.0) == ["lidar_late"]
     assert robot.drive(80, 0.0) == ["lidar_late"]
-    assert robot.drive(60, 0.0) == []  # at rest nothing is known any more
+    assert robot.drive(60, 0.0) == []  # at rest the delay is forgotten
 
 
-def test_one_that_becomes_late_is_named_when_the_turn_ends() -> None:
+def test_a_lidar_that_becomes_late_is_found_when_the_turn_ends() -> None:
     robot = Robot(0)
     assert robot.drive(100, 1.0, 0.1) == []
     robot.delay = 5
@@ -99,7 +99,7 @@ def test_one_that_becomes_late_is_named_when_the_turn_ends() -> None:
 
 @pytest.mark.long
 @pytest.mark.parametrize("body", [BODY, SLOW_LIDAR])
-def test_a_lidar_that_is_in_time_is_left_alone_however_the_body_drives(
+def test_a_lidar_without_delay_is_not_late_on_any_drive(
     body: BodyDescription,
 ) -> None:
     robot, chance = Robot(0, body), random.Random(3)
@@ -109,14 +109,14 @@ def test_a_lidar_that_is_in_time_is_left_alone_however_the_body_drives(
 
 
 @pytest.mark.parametrize("delay", [0, 5])
-def test_a_room_that_shows_no_turn_says_nothing(delay: int) -> None:
+def test_in_a_round_room_the_delay_stays_unknown(delay: int) -> None:
     robot = Robot(delay)
     robot.world = silo
     assert robot.drive(50, 1.0) == []
     assert robot.late.turns.ticks is None
 
 
-def test_who_drives_straight_on_learns_nothing() -> None:
+def test_driving_straight_on_the_delay_stays_unknown() -> None:
     robot = Robot(5)
     assert robot.drive(200, 0.0, 0.2) == []
     assert robot.late.turns.ticks is None
@@ -126,7 +126,7 @@ Change = Callable[[NDArray[np.float64]], None]
 
 
 def turned(change: Change, yaw: float) -> float | None:
-    """The turn that two scans of a room show, one of each changed like that; None without one."""
+    """Return the turn between two scans of a room, both changed by `change`; None if unknown."""
     delay, history = TurnDelay(), PoseHistory()
     for tick, seen in (
         (5, room(Pose(x=0.0, y=0.0, yaw=0.0))),

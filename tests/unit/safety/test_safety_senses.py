@@ -1,4 +1,4 @@
-"""Tilt, knocks, slow commands, and the computer itself."""
+"""Tilt, knocks, slow commands and the computer's resources."""
 
 import itertools
 import math
@@ -27,7 +27,7 @@ def rolled(degrees: float, axis: int = 0) -> tuple[float, float, float, float]:
 
 
 @pytest.mark.parametrize("axis", [0, 1])
-def test_a_tilted_body_stops_for_good_after_200_ms(axis: int) -> None:
+def test_a_tilted_body_latches_after_200_ms(axis: int) -> None:
     patrol = Patrol()
     assert patrol.go(50, imu=imu(rolled(29.0, axis))) == []
     assert patrol.go(9, imu=imu(rolled(31.0, axis))) == []
@@ -40,17 +40,17 @@ def test_turning_is_no_tilt() -> None:
     assert tilt_deg(rolled(180.0, 0)) == pytest.approx(180.0)
 
 
-def test_what_is_no_attitude_says_nothing_of_tilt() -> None:
+def test_an_invalid_orientation_has_no_tilt() -> None:
     assert tilt_deg((0.0, 0.0, 0.0, 0.0)) is None
     assert Patrol().go(50, imu=imu((0.0, 0.0, 0.0, 0.0))) == []
 
 
-def test_a_body_may_be_allowed_to_lean_farther() -> None:
+def test_the_limit_of_tilt_can_be_changed() -> None:
     legs = Patrol(replace(BODY, thresholds=Thresholds(tilt_stop=45.0)))
     assert legs.go(50, imu=imu(rolled(44.0))) == []
 
 
-def test_a_bumper_stops_the_body_for_good_at_once() -> None:
+def test_a_bumper_latches_at_once() -> None:
     patrol = Patrol()
     assert patrol.go(bumpers=(False, True)) == ["collision"]
     assert patrol.verdict.causes[0].latching
@@ -68,7 +68,7 @@ def test_slow_commands_halve_the_speed_after_a_second() -> None:
     patrol = Patrol()
     assert patrol.go(200, echo_ages=(5,)) == []  # 100 ms
     ticks = patrol.ticks_until("round_trip", 60, echo_ages=(6,))
-    assert ticks == 51  # two of a hundred are more than one in a hundred, then a second
+    assert ticks == 51  # 1 tick until two of a hundred commands are slow, then a second
     assert patrol.verdict.verdict == "slow"
     caps = patrol.verdict.caps
     assert (caps.forward, caps.backward, caps.rotation) == (0.13, 0.13, 0.91)
@@ -84,7 +84,7 @@ def test_slow_commands_at_ten_hertz_halve_the_speed_after_a_second_too() -> None
     assert patrol.go(echo_ages=(6,)) == ["round_trip"]
 
 
-def test_slow_commands_count_also_where_they_come_with_a_second_verdict_of_a_tick() -> None:
+def test_slow_commands_count_also_at_a_second_verdict_of_a_tick() -> None:
     limits, monitor = Thresholds(), RoundTrip()
     for _ in range(50):
         assert monitor.causes(limits) == ()
@@ -92,7 +92,7 @@ def test_slow_commands_count_also_where_they_come_with_a_second_verdict_of_a_tic
     assert [cause.code for cause in monitor.causes(limits)] == ["round_trip"]
 
 
-def test_a_late_command_without_another_after_it_does_nothing() -> None:
+def test_a_last_late_command_is_ignored() -> None:
     patrol = Patrol()
     patrol.go(echo_ages=(7,))
     for _ in range(200):
@@ -111,7 +111,7 @@ def test_slow_commands_do_not_count_for_the_next_commander() -> None:
         assert patrol.go(gate=other, echo_ages=(1,)) == []
 
 
-def test_a_single_slow_command_does_nothing() -> None:
+def test_single_slow_commands_are_ignored() -> None:
     patrol = Patrol()
     patrol.go(100, echo_ages=(1,))
     for _ in range(5):
@@ -119,7 +119,7 @@ def test_a_single_slow_command_does_nothing() -> None:
         assert patrol.go(120, echo_ages=(1,)) == []
 
 
-def test_a_host_without_room_is_a_warning_and_no_more() -> None:
+def test_scarce_resources_of_the_computer_are_warnings_only() -> None:
     patrol = Patrol()
     patrol.go(host=Host(disk_mb=499.0, cpu=95.1, memory=95.1))
     assert patrol.warnings == ["disk_low", "cpu_busy", "memory_low"]
@@ -132,11 +132,11 @@ SECONDS = itertools.count(1000)
 
 
 def disk_mb(watch: HostMonitor) -> float:
-    """Return the free disk space at the next reading [MB]; 0 before the disk has answered."""
+    """Return the free disk space at the next reading [MB]; 0 before the disk answers."""
     return watch.read(next(SECONDS) * 1_100_000_000).disk_mb or 0.0
 
 
-async def test_a_disk_that_hangs_holds_up_nothing(
+async def test_a_disk_that_hangs_does_not_block_safety(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     asked: list[object] = []
@@ -158,14 +158,14 @@ async def test_a_disk_that_hangs_holds_up_nothing(
     await until(lambda: disk_mb(watch) == 5.0, "the disk's answer")
 
 
-async def test_the_disk_of_a_folder_to_come_is_that_of_its_parent(
+async def test_a_missing_folder_is_on_the_disk_of_its_parent(
     tmp_path: Path,
 ) -> None:
     watch = HostMonitor(tmp_path / "gigabrain" / "runs")
     await until(lambda: disk_mb(watch) > 0, "the disk's answer")
 
 
-def test_the_host_is_looked_at_once_a_second(tmp_path: Path) -> None:
+def test_the_resources_are_read_once_a_second(tmp_path: Path) -> None:
     watch = HostMonitor(tmp_path)
     first = watch.read(1)
     assert watch.read(900_000_000) is first

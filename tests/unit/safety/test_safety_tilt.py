@@ -9,7 +9,7 @@ import pytest
 from gigabrain_zenoh.safety.depth import Up, view_of
 from tests.unit.safety.depth_scene import CAMERA, SEEING
 
-PIXELS = ((70, 90, 110), (80, 40, 120))  # rows and columns: far, on the left, near on the right
+PIXELS = ((70, 90, 110), (80, 40, 120))  # rows and columns: far, left, and near on the right
 Three = tuple[int, int, int]
 
 
@@ -23,7 +23,7 @@ Three = tuple[int, int, int]
         ((-0.3, -0.05), (182, 129, 107), (182, 129, 107), (65535, 508, 299)),
     ],
 )
-def test_nothing_counts_that_may_be_the_floor_of_a_level_or_of_the_tilted_body(
+def test_the_floor_of_the_level_or_the_tilted_body_is_no_obstacle(
     up: Up, above: Three, within: Three, below: Three
 ) -> None:
     view = view_of(SEEING, CAMERA, up)
@@ -32,7 +32,7 @@ def test_nothing_counts_that_may_be_the_floor_of_a_level_or_of_the_tilted_body(
 
 
 @pytest.mark.long
-def test_of_many_tilts_few_views_are_kept_which_share_what_no_tilt_changes() -> None:
+def test_few_views_are_cached_and_they_share_arrays_that_no_tilt_changes() -> None:
     level = view_of(SEEING, CAMERA)
     kept = []
     for number in range(1, 41):
@@ -42,4 +42,4 @@ def test_of_many_tilts_few_views_are_kept_which_share_what_no_tilt_changes() -> 
             assert getattr(view, name) is getattr(level, name)
     del view
     gc.collect()
-    assert sum(one() is not None for one in kept) <= 8
+    assert sum(view() is not None for view in kept) <= 8
