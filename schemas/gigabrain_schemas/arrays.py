@@ -1,6 +1,6 @@
-"""Encodes numpy arrays as messages carry them: little-endian bytes.
+"""Encodes numpy arrays as little-endian bytes for messages.
 
-The way back is a method of the message: `LaserScan.ranges_m`, `OccupancyGrid.array()` and others.
+Methods of the messages decode them: `LaserScan.ranges_m`, `OccupancyGrid.array()` and others.
 """
 
 import numpy as np

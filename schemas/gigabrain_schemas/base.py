@@ -1,8 +1,8 @@
 """The base of all messages, and the bounded types that they share.
 
-A bound on a float refuses NaN and infinity as well, so a message that decodes holds finite numbers.
-Every number has the bound of its kind, and every text and list a greatest length, so that no
-message exhausts a reader's memory or time.
+A bound on a float also refuses NaN and infinity, so decoded messages contain finite numbers only.
+Every number has bounds of its kind, and every text and list a maximum length. So no message can
+exhaust a reader's memory or time.
 """
 
 from collections.abc import Mapping
@@ -11,14 +11,14 @@ from typing import Annotated, Any
 import msgspec
 from msgspec import Meta
 
-Finite = Annotated[float, Meta(ge=-1e9, le=1e9)]  # of figures that no body moves by
+Finite = Annotated[float, Meta(ge=-1e9, le=1e9)]  # figures that do not move a body
 NonNegative = Annotated[float, Meta(ge=0.0, le=1e9)]
-Positive = Annotated[float, Meta(gt=0.0, le=1e9)]  # of settings
-Coordinate = Annotated[float, Meta(ge=-1e5, le=1e5)]  # [m], in a map or an odometry
+Positive = Annotated[float, Meta(gt=0.0, le=1e9)]  # settings
+Coordinate = Annotated[float, Meta(ge=-1e5, le=1e5)]  # [m], in a map or the odometry
 Distance = Annotated[float, Meta(ge=0.0, le=1e5)]  # [m]
 Range = Annotated[float, Meta(ge=0.0, le=1000.0)]  # [m], of a sensor
 Offset = Annotated[float, Meta(ge=-10.0, le=10.0)]  # [m], on a body
-Angle = Annotated[float, Meta(ge=-1e6, le=1e6)]  # [rad]; one that is summed up goes round often
+Angle = Annotated[float, Meta(ge=-1e6, le=1e6)]  # [rad]; sums of turns may be large
 LinearSpeed = Annotated[float, Meta(ge=-100.0, le=100.0)]  # [m/s]
 AngularSpeed = Annotated[float, Meta(ge=-100.0, le=100.0)]  # [rad/s]
 SpeedLimit = Annotated[float, Meta(ge=0.001, le=100.0)]  # [m/s] or [rad/s]
@@ -27,14 +27,14 @@ AccelerationLimit = Annotated[float, Meta(ge=0.001, le=1000.0)]  # [m/s2] or [ra
 Fraction = Annotated[float, Meta(ge=0.0, le=1.0)]
 Percentage = Annotated[float, Meta(ge=0.0, le=100.0)]
 Count = Annotated[int, Meta(ge=0, le=2**63 - 1)]
-Tick = Annotated[int, Meta(ge=0, le=2**38)]  # 170 years; in nanoseconds it still is 64 bits
-Milliseconds = Annotated[float, Meta(ge=0.0, le=1e12)]  # of a line that has been silent for years
+Tick = Annotated[int, Meta(ge=0, le=2**38)]  # 170 years; fits 64 bits in nanoseconds
+Milliseconds = Annotated[float, Meta(ge=0.0, le=1e12)]  # up to decades of silence
 Name = Annotated[str, Meta(max_length=64)]
 JointName = Annotated[str, Meta(min_length=1, max_length=64)]
 Text = Annotated[str, Meta(max_length=500)]
-Key = Annotated[str, Meta(max_length=256)]  # on the bus, or the name of a figure
+Key = Annotated[str, Meta(max_length=256)]  # key on the bus, or name of a figure
 
-Shape = tuple[str | int, ...]  # of an array: sizes, and names for those that vary
+Shape = tuple[str | int, ...]  # of an array: sizes, or names of sizes that vary
 
 
 def array_meta(
@@ -45,8 +45,8 @@ def array_meta(
 ) -> Meta:
     """Return the bounds of a field that holds an array as bytes, with notes for JSON Schema.
 
-    The notes are `x-dtype` (numpy's name), `x-byte-order`, `x-shape` and `x-unit`. Where they
-    depend on another field they are mappings from its values; null there is no array.
+    The notes are `x-dtype` (numpy's name), `x-byte-order`, `x-shape` and `x-unit`. If they depend
+    on another field, they are mappings from its values; null means that there is no array.
     """
     notes: dict[str, Any] = {"x-dtype": dtype, "x-byte-order": "little", "x-shape": shape}
     if unit:
@@ -54,7 +54,7 @@ def array_meta(
     return Meta(max_length=max_bytes, extra_json_schema=notes)
 
 
-TICK_NS = 20_000_000  # one tick of the robot's clock is 20 ms of the body's own time
+TICK_NS = 20_000_000  # one tick of the robot's clock: 20 ms of the body's time
 TICK_S, TICK_MS = TICK_NS / 1e9, TICK_NS / 1e6
 
 
@@ -66,10 +66,10 @@ class Message(Record, frozen=True, kw_only=True):
     """A value sent between processes, in SI units. The bus fills in these five fields."""
 
     stamp_ns: Count = 0  # Unix time of validity, for people and recordings; never for safety
-    seq: Count = 0  # counts what this sender sent on this key
-    boot: Count = 0  # which start of the driver the tick belongs to
-    tick: Tick = 0  # newest tick of the robot's clock that the sender had seen
-    basis: Tick = 0  # tick of the sensor data that the content rests on; 0 for none
+    seq: Count = 0  # number of this message, by sender and key
+    boot: Count = 0  # random number of the driver's start that the tick belongs to
+    tick: Tick = 0  # newest tick of the robot's clock that the sender knew
+    basis: Tick = 0  # tick of the sensor data that the content is based on; 0 for none
 
 
 class Pose(Record, frozen=True, kw_only=True):
@@ -89,12 +89,12 @@ class Velocity(Record, frozen=True, kw_only=True):
 
 
 class Cause(Record, frozen=True, kw_only=True):
-    """A reason why the robot is held back."""
+    """A reason why the robot is stopped or slowed."""
 
     code: Name  # see gigabrain_zenoh.gate.causes
     text: Text  # a sentence for people
-    latching: bool = False  # stays until a person releases it
-    remedy: Text = ""  # what to do about it, in the imperative
+    latching: bool = False  # lasts until a person releases it
+    remedy: Text = ""  # a request to the person, such as: charge it soon
 
 
 Causes = Annotated[tuple[Cause, ...], Meta(max_length=64)]

@@ -1,4 +1,4 @@
-"""The body: what it is, and what it is doing."""
+"""The description and the state of the body."""
 
 import math
 from typing import Annotated, Literal
@@ -29,7 +29,7 @@ DriveType = Literal[
     "differential", "skid_steer", "omni", "mecanum", "ackermann", "quadruped", "arm"
 ]
 SafeState = Literal["stop", "hold", "park", "limp"]
-# Of thresholds: what would as good as switch a monitor off, or is in another unit, is refused.
+# The bounds of thresholds refuse values that disable a monitor, or are in a wrong unit.
 PerCent = Annotated[float, Meta(ge=1.0, le=100.0)]
 Celsius = Annotated[float, Meta(ge=20.0, le=120.0)]
 Sustain = Annotated[float, Meta(ge=0.02, le=10.0)]  # [s]
@@ -43,7 +43,7 @@ OffBy = Annotated[float, Meta(gt=0.0, le=100.0)]  # [m/s] or [rad/s]
 Megabytes = Annotated[float, Meta(gt=0.0, le=1e9)]
 Volts = Annotated[float, Meta(ge=0.0, le=1000.0)]
 Amperes = Annotated[float, Meta(ge=-10_000.0, le=10_000.0)]
-JointPosition = Annotated[float, Meta(ge=-1e9, le=1e9)]  # [rad] or [m]; a wheel's adds up
+JointPosition = Annotated[float, Meta(ge=-1e9, le=1e9)]  # [rad] or [m]; a wheel's position grows
 JointSpeed = Annotated[float, Meta(ge=-10_000.0, le=10_000.0)]  # [rad/s] or [m/s]
 Effort = Annotated[float, Meta(ge=-1e5, le=1e5)]  # [N m] or [N]
 Temperature = Annotated[float, Meta(ge=-273.15, le=1000.0)]  # [deg C]
@@ -56,59 +56,59 @@ MAX_JOINTS = 128
 MAX_ARM_JOINTS = 32
 MAX_MODEL_CHARACTERS = 262_144
 MAX_KEEP_OUT = 16
-FOLLOW_SHARE = 0.06  # of a joint's range, by which it may be off what was sent
+FOLLOW_SHARE = 0.06  # of a joint's range, allowed distance from its setpoint
 MIN_AREA = 1e-4  # [m2]
 MIN_SPEED = 0.001  # [m/s], [rad/s]
 
 
 class Joint(Record, frozen=True, kw_only=True):
-    """One joint as measured."""
+    """The measured state of one joint."""
 
     name: JointName
     position: JointPosition  # [rad], or [m] for a sliding joint
     velocity: JointSpeed = 0.0  # [rad/s] or [m/s]
-    effort: Effort | None = None  # [N m] or [N]; None where it is not measured
+    effort: Effort | None = None  # [N m] or [N]; None if not measured
     temperature: Temperature | None = None  # [deg C] of its motor
     current: Amperes | None = None  # [A] of its motor
 
 
 class JointGains(Record, frozen=True, kw_only=True):
-    """The gains by which control corrects the commands to a joint that holds positions by itself.
+    """The gains of control's corrections for a joint whose servo holds positions.
 
-    The command is the wanted position plus five terms: `p` times the error, `i` times its integral
-    while the joint should rest, `d` times the error of speed, `feed_forward` times the wanted
-    speed, and `inertia` times the wanted acceleration.
+    The setpoint is the desired position plus five terms: `p` times the error, `i` times its
+    integral while the joint should rest, `d` times the error of speed, `feed_forward` times the
+    desired speed, and `inertia` times the desired acceleration.
     """
 
     p: Annotated[float, Meta(ge=0.0, le=10.0)] = 0.0
     i: Annotated[float, Meta(ge=0.0, le=20.0)] = 1.0  # [1/s]
     d: Annotated[float, Meta(ge=0.0, le=1.0)] = 0.0  # [s]
-    feed_forward: Annotated[float, Meta(ge=0.0, le=1.0)] = 0.0  # [s], how late the joint follows
-    inertia: Annotated[float, Meta(ge=0.0, le=0.1)] = 0.0  # [s2], over the stiffness of its servo
-    max_correction: Annotated[float, Meta(ge=0.0, le=0.5)] = 0.05  # [rad] or [m], of them all
+    feed_forward: Annotated[float, Meta(ge=0.0, le=1.0)] = 0.0  # [s], delay of the joint
+    inertia: Annotated[float, Meta(ge=0.0, le=0.1)] = 0.0  # [s2], inertia / stiffness of its servo
+    max_correction: Annotated[float, Meta(ge=0.0, le=0.5)] = 0.05  # [rad] or [m], of their sum
 
 
 Tolerance = Annotated[float, Meta(ge=0.0, le=100.0)]  # [rad] or [m]
 
 
 class JointDescription(Record, frozen=True, kw_only=True):
-    """A joint that can be commanded: how far, how fast and how hard it may move."""
+    """A joint that can be commanded, with its limits."""
 
     name: JointName
     part: Literal["arm", "gripper"] = "arm"
-    unit: Literal["rad", "m"] = "rad"  # m: it slides
+    unit: Literal["rad", "m"] = "rad"  # m for a sliding joint
     lower: JointPosition  # [rad], or [m] for a sliding joint
     upper: JointPosition  # [rad] or [m]
     max_speed: SpeedLimit  # [rad/s] or [m/s]
     max_acceleration: AccelerationLimit = 10.0  # [rad/s2] or [m/s2]
     max_jerk: Annotated[float, Meta(ge=0.01, le=1e5)] = 200.0  # [rad/s3] or [m/s3]
-    max_effort: Annotated[float, Meta(ge=0.0, le=1e5)] = 0.0  # [N m] or [N]; 0: not known
+    max_effort: Annotated[float, Meta(ge=0.0, le=1e5)] = 0.0  # [N m] or [N]; 0 if unknown
     gains: JointGains = JointGains()
-    path_tolerance: Tolerance = 0.3  # [rad] or [m], off a trajectory on the way; 0: not checked
-    goal_tolerance: Tolerance = 0.05  # [rad] or [m], off its end at rest; 0: not checked
-    max_current: Annotated[float, Meta(ge=0.0, le=10_000.0)] = 0.0  # [A]; 0: not known
+    path_tolerance: Tolerance = 0.3  # [rad] or [m], on a trajectory; 0: not checked
+    goal_tolerance: Tolerance = 0.05  # [rad] or [m], at a trajectory's end; 0: not checked
+    max_current: Annotated[float, Meta(ge=0.0, le=10_000.0)] = 0.0  # [A]; 0 if unknown
     follow: Annotated[float, Meta(gt=0.0, le=10.0)] | None = None
-    # [rad] or [m], measured position off what was sent; None: FOLLOW_SHARE of its range
+    # [rad] or [m], allowed distance from its setpoint; None: FOLLOW_SHARE of its range
 
     def __post_init__(self) -> None:
         if self.upper <= self.lower:
@@ -118,7 +118,7 @@ class JointDescription(Record, frozen=True, kw_only=True):
 
     @property
     def follow_error(self) -> float:
-        """Return the distance from the command that safety tolerates [rad] or [m]."""
+        """Return the distance from the setpoint that safety tolerates [rad] or [m]."""
         return self.follow or FOLLOW_SHARE * (self.upper - self.lower)
 
 
@@ -127,24 +127,24 @@ class KeepOut(Record, frozen=True, kw_only=True):
 
     name: Name
     center: tuple[Offset, Offset, Offset]  # [m]
-    size: tuple[BoxSide, BoxSide, BoxSide]  # [m], along its own x, y and z
+    size: tuple[BoxSide, BoxSide, BoxSide]  # [m], along the box's own x, y and z
     yaw: MountingAngle = 0.0  # [rad]
 
 
 class Arm(Record, frozen=True, kw_only=True):
-    """The data of an arm that the brain needs besides its joints and its model."""
+    """Data of an arm, besides its joints and its model."""
 
-    tool: Name = "tool"  # site of the model that reaches for things, along its x axis
+    tool: Name = "tool"  # site of the model that reaches for objects, along its x axis
     home: Annotated[tuple[JointPosition, ...], Meta(min_length=1, max_length=MAX_ARM_JOINTS)]
-    # [rad] or [m], a posture in which it is out of the way; one number for each joint
+    # [rad] or [m], posture that keeps the arm out of the way; one number per joint
     carry: Annotated[tuple[JointPosition, ...], Meta(max_length=MAX_ARM_JOINTS)] = ()
-    # the same, in which it holds a thing above its base while that drives; none: it has no such
-    rate_hz: Annotated[float, Meta(ge=50.0, le=200.0)] = 50.0  # of control's commands to its joints
-    goal_time: Sustain = 1.0  # [s] after the end of a trajectory until its joints are there
+    # [rad] or [m], posture to carry an object while the base drives; empty if there is none
+    rate_hz: Annotated[float, Meta(ge=50.0, le=200.0)] = 50.0  # of control's joint commands
+    goal_time: Sustain = 1.0  # [s] until joints must be at a trajectory's end
     floor: Annotated[float, Meta(ge=-10.0, le=10.0)] | None = None
-    # [m], height of the floor or table in the frame of its model; None: it cannot reach one
+    # [m], height of the floor or table in the model's frame; None: out of reach
     keep_out: Annotated[tuple[KeepOut, ...], Meta(max_length=MAX_KEEP_OUT)] = ()
-    voltage: tuple[Volts, Volts] | None = None  # [V], least and greatest of its supply
+    voltage: tuple[Volts, Volts] | None = None  # [V], minimum and maximum of its supply
 
     def __post_init__(self) -> None:
         if len({box.name for box in self.keep_out}) < len(self.keep_out):
@@ -158,41 +158,41 @@ class Battery(Record, frozen=True, kw_only=True):
 
     voltage: Volts  # [V]
     percentage: Percentage  # [%]
-    current: Amperes = 0.0  # [A], positive while it drains
+    current: Amperes = 0.0  # [A], positive while discharging
 
 
 class LinkHealth(Record, frozen=True, kw_only=True):
-    """State of the driver's line to the body."""
+    """State of the driver's connection to the body."""
 
     connected: bool = True
     age_ms: Milliseconds = 0.0  # since the body's last message
-    late_ms: Milliseconds | None = None  # delay beyond the shortest one; None: no clock to compare
-    errors: Count = 0  # frames that were thrown away
+    late_ms: Milliseconds | None = None  # delay beyond the shortest one; None without device clock
+    errors: Count = 0  # frames discarded
     reconnects: Count = 0
 
 
 class GateStatus(Record, frozen=True, kw_only=True):
-    """The gate's mode, its commander, and what holds the robot back."""
+    """The gate's mode, its commander, and the causes of stops."""
 
     mode: GateMode = "latched"
     causes: Causes = ()
-    estop_generation: Count = 0  # how often an e-stop was pressed; a release must name it
-    commander: Name = ""  # whose commands pass; empty for none
-    enables: Count = 0  # how often it was enabled since this boot
-    latches: Count = 0  # how often it has latched since this boot
+    estop_generation: Count = 0  # number of e-stops; a release must name it
+    commander: Name = ""  # source of commands that the gate obeys; empty for none
+    enables: Count = 0  # number of enables since this boot
+    latches: Count = 0  # number of latches since this boot
 
 
 class RobotState(Message, frozen=True, kw_only=True):
     """The body's own measurements. Its tick is the robot's clock."""
 
     robot_type: Name
-    pose: Pose  # odometry, since the driver's start
-    velocity: Velocity  # as measured
-    sent: Velocity = Velocity()  # last command to the body, as its protocol encodes it
+    pose: Pose  # odometry since the driver's start
+    velocity: Velocity  # measured
+    sent: Velocity = Velocity()  # last command to the body, rounded as its protocol encodes it
     joints: Annotated[tuple[Joint, ...], Meta(max_length=MAX_JOINTS)] = ()
     joints_sent: Annotated[tuple[JointPosition, ...], Meta(max_length=MAX_ARM_JOINTS)] = ()
-    # [rad] or [m], last positions to the body, in the order of its description
-    limp: bool = False  # its joints are let go of: a person can move them
+    # [rad] or [m], last setpoints of the body, in the order of its description
+    limp: bool = False  # the joints' torque is off: a person can move them
     battery: Battery | None = None
     imu: ImuData | None = None
     bumpers: Annotated[tuple[bool, ...], Meta(max_length=64)] = ()
@@ -201,7 +201,7 @@ class RobotState(Message, frozen=True, kw_only=True):
 
 
 class Lidar(Record, frozen=True, kw_only=True):
-    """A planar lidar and where it sits."""
+    """A planar lidar and its mounting."""
 
     beams: Annotated[int, Meta(ge=1, le=100_000)]
     rate_hz: Rate
@@ -210,7 +210,7 @@ class Lidar(Record, frozen=True, kw_only=True):
     x: Offset = 0.0  # [m], mounting in the body's frame
     y: Offset = 0.0  # [m]
     yaw: MountingAngle = 0.0  # [rad]
-    no_return: Literal["free", "unknown"] = "free"  # what an infinite range of this sensor means
+    no_return: Literal["free", "unknown"] = "free"  # meaning of an infinite range of this sensor
 
 
 Side = Annotated[int, Meta(ge=16, le=4096, multiple_of=2)]  # [px] of a picture
@@ -223,26 +223,26 @@ MAX_CAMERAS = 8
 
 
 class Camera(Record, frozen=True, kw_only=True):
-    """A camera: how it sees, and where it sits (REP-103: it looks along its own x axis)."""
+    """A camera: its optics, and its mounting (REP-103: it looks along its own x axis)."""
 
     name: CameraName
     width: Side = 320
     height: Side = 240
     rate_hz: Annotated[float, Meta(ge=0.5, le=120.0)] = 10.0
-    field_of_view: FieldOfView = 1.047  # [rad], horizontal, where `intrinsics` are not given
+    field_of_view: FieldOfView = 1.047  # [rad], horizontal, if there are no `intrinsics`
     intrinsics: tuple[FocalLength, FocalLength, PixelOffset, PixelOffset] | None = None
-    # [px]: fx, fy, cx, cy of its calibration
-    distortion: Annotated[tuple[Coefficient, ...], Meta(max_length=8)] = ()
+    # [px]: fx, fy, cx, cy of the calibration
     # k1, k2, p1, p2, k3, and k4, k5, k6 of the rational model
-    depth: bool = False  # measures the depth of each pixel too
-    depth_min: Range = 0.25  # [m]; nearer, the depth is unknown
+    distortion: Annotated[tuple[Coefficient, ...], Meta(max_length=8)] = ()
+    depth: bool = False  # the camera also measures the depth of each pixel
+    depth_min: Range = 0.25  # [m]; nearer depths are unknown
     depth_max: RangeMax = 6.0  # [m]
-    link: Name = ""  # body of the arm's model that it sits on; empty: the robot's own body
-    x: Offset = 0.0  # [m], mounting in the frame of the link; in the robot's, z is from the floor
+    link: Name = ""  # body of the arm's model that carries it; empty: the robot's base
+    x: Offset = 0.0  # [m], mounting in the link's frame; in the base's frame z is from the floor
     y: Offset = 0.0  # [m]
     z: Offset = 0.0  # [m]
     roll: MountingAngle = 0.0  # [rad]
-    pitch: MountingAngle = 0.0  # [rad], positive looks down
+    pitch: MountingAngle = 0.0  # [rad], positive is down
     yaw: MountingAngle = 0.0  # [rad]
 
     def __post_init__(self) -> None:
@@ -253,7 +253,7 @@ class Camera(Record, frozen=True, kw_only=True):
 
     @property
     def pinhole(self) -> tuple[float, float, float, float]:
-        """The intrinsics fx, fy, cx, cy [px], from the field of view where none were measured."""
+        """The intrinsics fx, fy, cx, cy [px]; by the field of view if not calibrated."""
         if self.intrinsics:
             return self.intrinsics
         focal = self.width / 2 / math.tan(self.field_of_view / 2)
@@ -266,7 +266,7 @@ class ControlGains(Record, frozen=True, kw_only=True):
     linear_integral: Gain = 1.5  # [1/s]
     angular_integral: Gain = 1.5  # [1/s]
     max_correction: Annotated[float, Meta(ge=0.0, le=0.5)] = 0.25  # of the commanded speed
-    rate_hz: Annotated[float, Meta(ge=12.5, le=50.0)] = 50.0  # of commands; whole ticks apart
+    rate_hz: Annotated[float, Meta(ge=12.5, le=50.0)] = 50.0  # of commands; periods are whole ticks
 
     @property
     def period_ticks(self) -> int:
@@ -278,39 +278,39 @@ class Thresholds(Record, frozen=True, kw_only=True):
     """The thresholds of safety. None of them can be switched off."""
 
     battery_warn: PerCent = 15.0  # [%], charge it soon
-    battery_return: PerCent = 7.0  # [%], decision comes to rest
-    battery_stop: PerCent = 5.0  # [%], it stops and latches
-    battery_sustain: Sustain = 2.0  # [s], how long it must be so low; sags do not count
+    battery_return: PerCent = 7.0  # [%], decision stops the robot
+    battery_stop: PerCent = 5.0  # [%], the robot stops and latches
+    battery_sustain: Sustain = 2.0  # [s], a shorter sag does not count
     motor_warn: Celsius = 60.0  # [deg C]
-    motor_stop: Celsius = 70.0  # [deg C], it stops and latches
+    motor_stop: Celsius = 70.0  # [deg C], the robot stops and latches
     motor_sustain: Sustain = 0.5  # [s]
-    missing_after: Sustain = 2.0  # [s] without a value that the body has shown to measure
-    scan_age: Age = 0.25  # [s], or 1.5 scans where that is longer
-    heartbeat: Age = 0.15  # [s] without an answer from one of the three systems
-    round_trip: Age = 0.1  # [s], 99 of 100 commands echo a tick younger than this
+    missing_after: Sustain = 2.0  # [s] without a value that the body measured before
+    scan_age: Age = 0.25  # [s], or 1.5 scan periods if that is longer
+    heartbeat: Age = 0.15  # [s] without an answer of perception, decision or control
+    round_trip: Age = 0.1  # [s], 99 of 100 commands must echo a younger tick
     round_trip_sustain: Sustain = 1.0  # [s]
-    follow_linear: OffBy = 0.05  # [m/s], measured speed off what was commanded
+    follow_linear: OffBy = 0.05  # [m/s], tolerance between measured and commanded speed
     follow_angular: OffBy = 0.3  # [rad/s]
     follow_sustain: Sustain = 0.3  # [s]
-    stuck_sustain: Sustain = 2.0  # [s] without moving at all
-    response: Age = 0.1  # [s], how late the measured speed follows when all is well
-    late: Age = 0.07  # [s], by which data may be later than they can be, or than `response`
+    stuck_sustain: Sustain = 2.0  # [s] without motion
+    response: Age = 0.1  # [s], normal delay of the measured speed
+    late: Age = 0.07  # [s], allowed delay beyond the shortest one, or beyond `response`
     late_sustain: Sustain = 0.2  # [s]
-    frozen_sustain: Sustain = 0.4  # [s] of values that do not change while it should move
-    tilt_stop: Annotated[float, Meta(ge=5.0, le=90.0)] = 30.0  # [deg], it stops and latches
+    frozen_sustain: Sustain = 0.4  # [s] of constant values during commanded motion
+    tilt_stop: Annotated[float, Meta(ge=5.0, le=90.0)] = 30.0  # [deg], the robot stops and latches
     shock_stop: Annotated[float, Meta(ge=1.0, le=200.0)] = (
-        40.0  # [m/s2], horizontally; it stops and latches
+        40.0  # [m/s2], horizontal; the robot stops and latches
     )
-    disk_warn: Megabytes = 500.0  # [MB] left where safety runs
+    disk_warn: Megabytes = 500.0  # [MB] free on safety's host
     cpu_warn: PerCent = 95.0  # [%] of all cores, over ten seconds
     memory_warn: PerCent = 95.0  # [%] in use
     reaction_time: Age = 0.22  # [s], scan period + bus + gate + drive
-    stop_margin: Margin = 0.08  # [m], kept free in front of a stopped robot
-    resume_margin: Margin = 0.10  # [m], more than the stop zone before the body may go on
-    side_margin: Margin = 0.03  # [m], kept free beside the body as it moves on
-    joint_sustain: Sustain = 0.5  # [s], a joint is off what was sent; it stops and latches
-    effort_sustain: Sustain = 1.0  # [s] at its greatest effort or current; it stops and latches
-    arm_clearance: Clearance = 0.005  # [m], kept free between the arm and what it must not touch
+    stop_margin: Margin = 0.08  # [m], kept free before a stopped robot
+    resume_margin: Margin = 0.10  # [m], beyond the stop zone, that must be free to go on
+    side_margin: Margin = 0.03  # [m], kept free beside the moving body
+    joint_sustain: Sustain = 0.5  # [s] away from its setpoint; the robot stops and latches
+    effort_sustain: Sustain = 1.0  # [s] at maximum effort or current; the robot stops and latches
+    arm_clearance: Clearance = 0.005  # [m], kept free around the arm
 
     def __post_init__(self) -> None:
         if not self.battery_stop <= self.battery_return <= self.battery_warn:
@@ -323,35 +323,35 @@ DEFAULT = Thresholds()
 
 
 class BodyDescription(Record, frozen=True, kw_only=True):
-    """Everything that the brain has to know of a body. The common part of a robot's YAML file."""
+    """The description of a body for the brain. The common part of a robot's YAML file."""
 
-    robot_type: Name  # what it is called
-    drive_type: DriveType  # how it moves
+    robot_type: Name  # name of the model
+    drive_type: DriveType
     footprint: Annotated[tuple[tuple[Offset, Offset], ...], Meta(min_length=3, max_length=64)]
     # [m], corners in the body's frame, in order
-    max_linear_speed: SpeedCap = 0.0  # [m/s]; only an arm without a base has none
+    max_linear_speed: SpeedCap = 0.0  # [m/s]; 0 only for an arm without a base
     max_lateral_speed: SpeedCap = 0.0  # [m/s]
     max_angular_speed: SpeedCap = 0.0  # [rad/s]
     max_linear_acceleration: AccelerationLimit = 1.0  # [m/s2]
     max_linear_deceleration: AccelerationLimit = 1.0  # [m/s2]
     max_angular_acceleration: AccelerationLimit = 3.0  # [rad/s2]
     wheel_separation: Annotated[float, Meta(ge=0.0, le=10.0)] = 0.0
-    # [m], left to right; of omni wheels, to the next one
-    wheel_radius: Annotated[float, Meta(ge=0.0, le=2.0)] = 0.0  # [m]; 0: not known, or no wheels
+    # [m], from left to right; of omni wheels, to the next one
+    wheel_radius: Annotated[float, Meta(ge=0.0, le=2.0)] = 0.0  # [m]; 0: unknown, or no wheels
     max_rim_speed: SpeedLimit | None = None
-    # [m/s], of a wheel of a differential or omni base; None: it has its largest speeds all at once
+    # [m/s], of a wheel of a differential or omni base; None: it reaches all maximum speeds at once
     min_turning_radius: Annotated[float, Meta(ge=0.0, le=100.0)] = 0.0
     # [m], of an Ackermann base; 0: max_linear_speed / max_angular_speed
-    body_height: Annotated[float, Meta(ge=0.01, le=10.0)] = 0.5  # [m], of its highest part
+    body_height: Annotated[float, Meta(ge=0.01, le=10.0)] = 0.5  # [m], height of its top
+    # joints that can be commanded, from the base to the tool
     joints: Annotated[tuple[JointDescription, ...], Meta(max_length=MAX_ARM_JOINTS)] = ()
-    # that can be commanded, from the base to the tool
     arm: Arm | None = None
     lidar: Lidar | None = None
     cameras: Annotated[tuple[Camera, ...], Meta(max_length=MAX_CAMERAS)] = ()
     thresholds: Thresholds = DEFAULT
     control: ControlGains = ControlGains()
-    safe_state: SafeState = "stop"  # what the driver brings it to when it ends
-    control_topic: Key = "robot/cmd_vel"  # the key that its driver obeys
+    safe_state: SafeState = "stop"  # state in which the driver leaves the body
+    control_topic: Key = "robot/cmd_vel"  # key of the commands that the driver obeys
 
     def __post_init__(self) -> None:
         if _area(self.footprint) < MIN_AREA:
@@ -410,12 +410,12 @@ class BodyDescription(Record, frozen=True, kw_only=True):
 
     @property
     def has_base(self) -> bool:
-        """Return whether it can drive; an arm that is fixed cannot."""
+        """Return whether the body can drive; a fixed arm cannot."""
         return self.drive_type != "arm"
 
     @property
     def fixed_cameras(self) -> tuple[Camera, ...]:
-        """The cameras that do not move with an arm, so that it is known what they look at."""
+        """The cameras that do not move with an arm."""
         return tuple(camera for camera in self.cameras if not camera.link)
 
     @property
@@ -440,14 +440,14 @@ def _area(corners: tuple[tuple[float, float], ...]) -> float:
 
 
 class Body(Message, frozen=True, kw_only=True):
-    """The body that the driver serves. The last value is kept for those who join late."""
+    """The body that the driver serves. The last value is kept for late joiners."""
 
     description: BodyDescription
     link: Literal["sim", "emulated", "real"]
 
 
 class ArmModel(Message, frozen=True, kw_only=True):
-    """The model of a body with an arm. The last value is kept for those who join late."""
+    """The model of a body with an arm. The last value is kept for late joiners."""
 
+    # MuJoCo XML with primitive shapes only; its joints have the names of the description
     mjcf: Annotated[str, Meta(max_length=MAX_MODEL_CHARACTERS)]
-    # MuJoCo's XML, of primitives only; its joints have the names of the description

@@ -37,16 +37,16 @@ Delay = Annotated[float, Meta(ge=0.0, le=10.0)]  # [s]
 
 
 class Obstacle(Record, frozen=True, kw_only=True):
-    """Something that perception follows from scan to scan."""
+    """An obstacle that perception tracks from scan to scan."""
 
     id: Count
-    x: Coordinate  # [m], in the frame of the odometry
+    x: Coordinate  # [m], in the odometry's frame
     y: Coordinate  # [m]
     velocity_x: LinearSpeed = 0.0  # [m/s]
     velocity_y: LinearSpeed = 0.0  # [m/s]
     radius: Annotated[float, Meta(ge=0.0, le=10.0)]  # [m]
-    covariance: Annotated[tuple[Finite, ...], Meta(max_length=16)] = ()
     # of (x, y, velocity_x, velocity_y), 16 values by row
+    covariance: Annotated[tuple[Finite, ...], Meta(max_length=16)] = ()
 
     def __post_init__(self) -> None:
         if len(self.covariance) not in (0, 16):
@@ -54,11 +54,11 @@ class Obstacle(Record, frozen=True, kw_only=True):
 
 
 class DetectedObject(Obstacle, frozen=True, kw_only=True):
-    """Something that a perceptor has found."""
+    """An object that a perceptor found."""
 
-    label: Name  # what it is, such as person
+    label: Name  # class, such as person
     confidence: Fraction = 1.0
-    avoid: bool = False  # the planner keeps clear of it, as of an obstacle
+    avoid: bool = False  # the planner avoids it like an obstacle
 
 
 class Objects(Message, frozen=True, kw_only=True):
@@ -72,9 +72,9 @@ Corner = tuple[Coordinate, Coordinate]
 
 
 class Contour(Record, frozen=True, kw_only=True):
-    """The outline of something that a camera saw above the floor, or of a hole in it.
+    """The outline of an object that a camera saw on the floor, or of a hole in the floor.
 
-    What lies below the floor, such as a step down, has a negative `bottom`.
+    A hole, such as a step down, has a negative `bottom`.
     """
 
     polygon: Annotated[tuple[Corner, ...], Meta(min_length=3, max_length=64)]
@@ -83,8 +83,8 @@ class Contour(Record, frozen=True, kw_only=True):
     top: Height  # [m]
     age: Annotated[float, Meta(ge=0.0, le=1e6)] = 0.0  # [s] since it was last seen
     confidence: Fraction = 1.0
-    track: Count = 0  # the same from picture to picture
-    source: Literal["depth", "floor_colour"] = "depth"  # by colour alone it has no height
+    track: Count = 0  # number that stays the same from picture to picture
+    source: Literal["depth", "floor_colour"] = "depth"  # floor_colour measures no height
 
     def __post_init__(self) -> None:
         if self.top < self.bottom:
@@ -92,28 +92,28 @@ class Contour(Record, frozen=True, kw_only=True):
 
 
 class CameraStatus(Record, frozen=True, kw_only=True):
-    """The health of a camera. It is `ok` while its pictures can be believed."""
+    """The health of a camera. It is `ok` while its pictures are plausible."""
 
     name: Name
     ok: bool
-    problem: Text = ""  # why not: covered, frozen, no picture
-    exposure: Tick = 0  # of its newest picture whose contours are in the world; 0 for none
+    problem: Text = ""  # why it is not ok: covered, frozen, no picture
+    exposure: Tick = 0  # tick of the newest picture with contours in the world; 0 for none
 
 
 class WorldModel(Message, frozen=True, kw_only=True):
-    """The robot's surroundings now, in the body's frame."""
+    """The robot's present surroundings, in the body's frame."""
 
     scan_ok: bool
-    scan_problem: Text = ""  # why the scan cannot be believed
-    obstacle_ahead: bool  # true as well while that is unknown
+    scan_problem: Text = ""  # why the scan is not plausible
+    obstacle_ahead: bool  # also true while unknown
     distance_ahead: Distance | None = None  # [m] to the nearest hit ahead; None: none or unknown
     sectors: Annotated[tuple[Distance | None, ...], Meta(max_length=3600)] = ()
-    # [m], nearest hit per equal sector, counter-clockwise, the first centred ahead; None for none
+    # [m], nearest hit per equal sector, counter-clockwise, the first centred ahead; None: no hit
     obstacles: Annotated[tuple[Obstacle, ...], Meta(max_length=256)] = ()
     contours: Annotated[tuple[Contour, ...], Meta(max_length=128)] = ()
     cameras: Annotated[tuple[CameraStatus, ...], Meta(max_length=MAX_CAMERAS)] = ()
+    # float32 little-endian [m], (n, 2): points that beams hit; for navigation only
     hits: Annotated[bytes, array_meta(64 * 1024, "float32", ("n", 2), "m")] = b""
-    # float32 little-endian [m], (n, 2): where beams hit; only for navigation
 
     def __post_init__(self) -> None:
         if len(self.hits) % 8:
@@ -122,7 +122,7 @@ class WorldModel(Message, frozen=True, kw_only=True):
     def points(self) -> "NDArray[np.float32]":
         """Return the points that beams hit [m], (n, 2) in the body's frame.
 
-        Points with NaN or infinity are left out, so that all can be used in computations.
+        Points with NaN, infinity or coordinates beyond FARTHEST_HIT are left out.
         """
         import numpy as np
 
@@ -145,15 +145,15 @@ CELL_VALUES = bytes((*range(101), 255))  # as int8: 0 to 100, and -1
 
 
 class OccupancyGrid(Message, frozen=True, kw_only=True):
-    """A map. The last value is kept for those who join late."""
+    """A map. The last value is kept for late joiners."""
 
     resolution: Resolution  # [m] per cell
     width: Cells  # cells
     height: Cells  # cells
     origin_x: Coordinate  # [m], of the corner of cell (0, 0)
     origin_y: Coordinate  # [m]
-    cells: Annotated[bytes, array_meta(8 * 1024 * 1024, "int8", ("height", "width"))]
     # int8, (height, width) by row: 0 free to 100 occupied, -1 unknown
+    cells: Annotated[bytes, array_meta(8 * 1024 * 1024, "int8", ("height", "width"))]
 
     def __post_init__(self) -> None:
         if len(self.cells) != self.width * self.height:
@@ -175,7 +175,7 @@ class TrajectoryPoint(msgspec.Struct, frozen=True, array_like=True, forbid_unkno
     x: Coordinate  # [m]
     y: Coordinate  # [m]
     yaw: Angle  # [rad]
-    linear_x: LinearSpeed = 0.0  # [m/s], in the body's frame of then
+    linear_x: LinearSpeed = 0.0  # [m/s], in the body's frame at `t`
     linear_y: LinearSpeed = 0.0  # [m/s]
     angular_z: AngularSpeed = 0.0  # [rad/s]
 
@@ -191,7 +191,7 @@ class ActuationModel(Record, frozen=True, kw_only=True):
 
 
 class JointTarget(Record, frozen=True, kw_only=True):
-    """The wanted position of one joint."""
+    """The desired position of one joint."""
 
     name: JointName
     position: JointPosition  # [rad] or [m]
@@ -201,16 +201,16 @@ LONGEST_WINDOW_S = 3.0  # of a joint trajectory in an intent
 
 
 class JointTrajectory(Record, frozen=True, kw_only=True):
-    """The wanted positions of joints from tick to tick: a window that decision keeps renewing.
+    """The desired positions of joints over time: a window that decision keeps renewing.
 
-    Between the points positions are interpolated; after the last one the joints stay there.
+    Positions between the points are interpolated; after the last point the joints stay.
     """
 
     name: Annotated[tuple[JointName, ...], Meta(min_length=1, max_length=MAX_ARM_JOINTS)]
-    start: Tick  # of the first point, by the robot's clock
+    start: Tick  # tick of the first point
     period: Annotated[float, Meta(ge=0.001, le=1.0)]  # [s] from point to point
-    positions: Annotated[bytes, array_meta(12 * 1024, "float32", ("n", "joints"), "rad")]
     # float32 little-endian [rad] or [m], (n, joints)
+    positions: Annotated[bytes, array_meta(12 * 1024, "float32", ("n", "joints"), "rad")]
 
     def __post_init__(self) -> None:
         joints = len(self.name)
@@ -234,32 +234,32 @@ class JointTrajectory(Record, frozen=True, kw_only=True):
 
 
 class Intent(Message, frozen=True, kw_only=True):
-    """Decision's wish, the motion that it expects, and its reason."""
+    """Decision's output: the desired motion, its expected trajectory, and the reason."""
 
     twist: Velocity | None = None
     joints: Annotated[tuple[JointTarget, ...], Meta(max_length=MAX_ARM_JOINTS)] = ()
     joint_trajectory: JointTrajectory | None = None  # instead of `joints`
     trajectory: Annotated[tuple[TrajectoryPoint, ...], Meta(max_length=256)] = ()
-    follow: bool = False  # control keeps to the trajectory; without, it gives the body the twist
-    response: ActuationModel = ActuationModel()  # what the trajectory counts on
-    progress: Fraction = 0.0  # how far the present step has come, as expected against as measured
+    follow: bool = False  # control follows the trajectory; otherwise it commands the twist
+    response: ActuationModel = ActuationModel()  # model of the body behind the trajectory
+    progress: Fraction = 0.0  # share of the present step that is done
     behaviour: Name
-    reason: Text  # in words, for people
+    reason: Text  # a sentence for people
 
 
 class GraspPose(Record, frozen=True, kw_only=True):
-    """A pose of fingers that may hold a thing: x is the approach, and they close along z."""
+    """A pose of fingers that may hold an object: they approach along x and close along z."""
 
     position: tuple[Coordinate, Coordinate, Coordinate]  # [m], between them, in the body's frame
     orientation: Quaternion  # x, y, z, w
-    opening: Annotated[float, Meta(gt=0.0, le=10.0)]  # [m], between the fingers at the thing
+    opening: Annotated[float, Meta(gt=0.0, le=10.0)]  # [m], between the fingers at the object
 
 
 class ArmPlan(Message, frozen=True, kw_only=True):
-    """The planned path of an arm's tool, for viewers. It is empty once the arm is there."""
+    """The planned path of an arm's tool, for viewers. It is empty once the arm has arrived."""
 
-    path: Annotated[bytes, array_meta(12 * 1024, "float32", ("n", 3), "m")] = b""
     # float32 little-endian [m], (n, 3) in the body's frame
+    path: Annotated[bytes, array_meta(12 * 1024, "float32", ("n", 3), "m")] = b""
     grasps: Annotated[tuple[GraspPose, ...], Meta(max_length=16)] = ()  # the chosen one first
 
     def __post_init__(self) -> None:
@@ -275,20 +275,20 @@ class ArmPlan(Message, frozen=True, kw_only=True):
 
 
 class Twist(Message, frozen=True, kw_only=True):
-    """A velocity that an operator asks for."""
+    """A velocity that an operator requests."""
 
     linear_x: LinearSpeed  # [m/s]
     linear_y: LinearSpeed = 0.0  # [m/s]
     angular_z: AngularSpeed = 0.0  # [rad/s]
-    source: Name = ""  # who asks: of several operators control follows one at a time
+    source: Name = ""  # the operator; control follows one of them at a time
 
 
 class JointSpeeds(Message, frozen=True, kw_only=True):
-    """Velocities of joints that an operator asks for; other joints are held."""
+    """Velocities of joints that an operator requests; other joints are held."""
 
     name: Annotated[tuple[JointName, ...], Meta(min_length=1, max_length=MAX_ARM_JOINTS)]
     velocity: Annotated[tuple[JointSpeed, ...], Meta(max_length=MAX_ARM_JOINTS)]  # [rad/s] or [m/s]
-    source: Name = ""  # who asks, as in Twist
+    source: Name = ""  # the operator, as in Twist
 
     def __post_init__(self) -> None:
         if len(self.velocity) != len(self.name):
@@ -298,19 +298,19 @@ class JointSpeeds(Message, frozen=True, kw_only=True):
 
 
 class CmdVel(Message, frozen=True, kw_only=True):
-    """A velocity that the gate is asked to let through to the body."""
+    """A command to the gate: a velocity of the body."""
 
     linear_x: LinearSpeed  # [m/s]
     linear_y: LinearSpeed = 0.0  # [m/s]
     angular_z: AngularSpeed = 0.0  # [rad/s]
-    source: Name = ""  # who commands
+    source: Name = ""  # of the command
     operator: bool = False  # control follows an operator's teleop stream, not decision's intent
 
 
 class JointCommand(Message, frozen=True, kw_only=True):
-    """The wanted positions and velocities of joints, a tick later.
+    """A command to the gate: positions and velocities of joints for the next tick.
 
-    Positions alone are to be reached and kept; velocities alone are kept up.
+    With positions only, joints move there and stay. With velocities only, they keep them up.
     """
 
     name: Annotated[tuple[JointName, ...], Meta(min_length=1, max_length=MAX_ARM_JOINTS)]
@@ -319,7 +319,7 @@ class JointCommand(Message, frozen=True, kw_only=True):
     velocity: Annotated[
         tuple[JointSpeed, ...], Meta(max_length=MAX_ARM_JOINTS)
     ] = ()  # [rad/s] or [m/s]
-    source: Name = ""  # who commands
+    source: Name = ""  # of the command
     operator: bool = False  # control follows an operator's stream, not decision's intent
 
     def __post_init__(self) -> None:

@@ -1,7 +1,7 @@
 """One realistic example of every message, and files for other languages.
 
-The folder `golden` holds each example as it is on the wire. The JSON is written by hand;
-`python -m gigabrain_schemas.examples` formats it and makes the MessagePack.
+The folder `golden` has each example as JSON and as MessagePack, as on the wire. The JSON is
+written by hand; `python -m gigabrain_schemas.examples` formats it and writes the MessagePack.
 """
 
 import sys
@@ -19,7 +19,7 @@ FOLDER = Path(__file__).parent / "golden"
 
 
 def example(kind: type[M], folder: Path = FOLDER) -> M:
-    """Return the example of one message type. Raises FileNotFoundError where it has none."""
+    """Return the example of one message type. Raises FileNotFoundError without one."""
     return msgspec.json.decode((folder / f"{kind.__name__}.json").read_bytes(), type=kind)
 
 
@@ -27,7 +27,7 @@ EXAMPLES: dict[str, Message] = {kind.__name__: example(kind) for kind in message
 
 
 def export(folder: Path) -> list[Path]:
-    """Write `<Message>.json` each, `topics.json` and `services.json`; return the paths.
+    """Write `<Message>.json` per message, `topics.json` and `services.json`; return the paths.
 
     Raises OSError.
     """
@@ -78,7 +78,7 @@ def files() -> dict[str, bytes]:
 
 
 def write(folder: Path) -> None:
-    """Write all golden files, and remove those whose message is gone."""
+    """Write all golden files, and remove those of removed messages."""
     folder.mkdir(parents=True, exist_ok=True)
     wanted = files()
     for path in folder.iterdir():

@@ -1,4 +1,4 @@
-"""Logs of a robot: who acted on it, and what each process has consumed for its outputs."""
+"""Logs of a robot: audit log, input logs of processes, and accepted requests."""
 
 from typing import Annotated, Literal
 
@@ -9,36 +9,36 @@ from gigabrain_schemas.tasks import MAX_REQUEST_BYTES
 
 MAX_RECORDS = 1000
 What = Literal[
-    "boot",  # the driver has started
-    "end",  # the driver ends, and leaves the body in its safe state
+    "boot",  # the driver starts
+    "end",  # the driver ends, with the body in its safe state
     "estop",
     "release",
     "enable",
-    "limp",  # an arm's joints are let go of
-    "hold",  # and held again
-    "take",  # an enable that took the body from another source
-    "mode",  # the gate's mode has changed
-    "raised",  # a cause, by safety, the driver or the gate
-    "cleared",
-    "refused",  # commands that were not obeyed
-    "stranger",  # a client that was refused at the router
+    "limp",  # torque of an arm's joints is switched off
+    "hold",  # torque is switched on again
+    "take",  # an enable took the body from another source
+    "mode",  # the gate's mode changed
+    "raised",  # a cause of safety, the driver or the gate began
+    "cleared",  # a cause ended
+    "refused",  # commands were not obeyed
+    "stranger",  # the router refused a client
 ]
 
 
 class AuditRecord(Message, frozen=True, kw_only=True):
-    """One entry. Its wall time is `stamp_ns`, the robot's time is `boot` and `tick`."""
+    """An audit entry. Its wall time is `stamp_ns`, its robot time `boot` and `tick`."""
 
-    process: Name  # that wrote it down
+    process: Name  # that wrote the entry
     what: What
-    source: Name  # who did it, or asked for it
-    ok: bool = True  # whether it was granted
+    source: Name  # the person or process that acted
+    ok: bool = True  # the request was accepted
     code: Name = ""  # of the cause, the mode or the refusal
     text: Text = ""  # a sentence for people
-    times: Count = 1  # how often it has happened, where the same happens again and again
+    times: Count = 1  # number of equal events that this entry stands for
 
 
 class AuditRequest(Message, frozen=True, kw_only=True):
-    """Asks for the newest entries. An empty request will do."""
+    """Ask for the newest entries. The request may be empty."""
 
     newest: Annotated[int, Meta(ge=1, le=MAX_RECORDS)] = 100
 
@@ -53,22 +53,22 @@ MAX_ENTRIES = 4096  # entries in one message
 
 
 class ConsumedInput(Struct, frozen=True, array_like=True, forbid_unknown_fields=True):
-    """One message that a process has used, or one piece of background work."""
+    """One message that a process used, or one piece of background work."""
 
-    key: Count  # which of the keys
-    seq: Count  # the message's own; of work: 1 where it was done in time, 0 where it was not
+    key: Count  # index in `keys`
+    seq: Count  # `seq` of the message; of work: 1 if it was done in time, else 0
     after_us: Count  # [µs] after `began_ns`
 
 
 class InputLog(Message, frozen=True, kw_only=True):
-    """All inputs that a process has used since its last InputLog, in its own order.
+    """All inputs that a process used since its last InputLog, in the order of use.
 
-    A busy process skips messages, and those on different keys arrive in any order; only the process
-    knows what its output rests on. The key WAITED stands for background work that is due,
-    FINISHED for such work that counts as soon as it is finished.
+    A busy process skips messages, and those on different keys arrive in any order. So only the
+    process knows the inputs of its outputs. The key WAITED stands for background work that is due,
+    FINISHED for work that counts as soon as it is finished.
     """
 
-    began_ns: Count  # Unix time of the first entry, by the process's own clock
+    began_ns: Count  # Unix time of the first entry, by the process's clock
     keys: Annotated[tuple[Key, ...], Meta(max_length=MAX_ENTRIES)]
     taken: Annotated[tuple[ConsumedInput, ...], Meta(max_length=MAX_ENTRIES)]
 
@@ -82,9 +82,9 @@ FINISHED = "~finished"
 
 
 class AcceptedRequest(Message, frozen=True, kw_only=True):
-    """A request that a process accepted, published at the moment from which it counts.
+    """A request that a process accepted, published when it takes effect.
 
-    It is an input like any message: `tick` and `basis` are the newest that the process had used.
+    It is an input like any message: `tick` and `basis` are those of the newest inputs.
     """
 
     process: Name = ""  # that accepted it

@@ -26,17 +26,17 @@ Label = Annotated[str, Meta(min_length=1, max_length=64)]
 Extent = tuple[Distance, Distance]  # [m] width and height
 Length = Annotated[float, Meta(gt=0.0, le=10.0)]  # [m]
 Seconds = Annotated[float, Meta(ge=0.0, le=1e9)]
-SIZES = {"box": 3, "cylinder": 2, "sphere": 1}  # lengths that say how large a solid is
+SIZES = {"box": 3, "cylinder": 2, "sphere": 1}  # number of lengths in the size of a solid
 
 
 class Detection(Record, frozen=True, kw_only=True):
-    """A thing in a picture."""
+    """An object in a picture."""
 
-    label: Label  # its class
+    label: Label  # class
     confidence: Fraction
     box: Box
-    position: Point | None = None  # [m], its middle in the body's frame at the exposure; by depth
-    in_map: Point | None = None  # [m], the same in the map; None where the robot is not localized
+    position: Point | None = None  # [m], middle in the body's frame at the exposure; by depth
+    in_map: Point | None = None  # [m], the same in the map; None if not localized
     size: Extent | None = None  # by depth
 
 
@@ -45,7 +45,7 @@ class TagDetection(Record, frozen=True, kw_only=True):
 
     id: TagId
     corners: tuple[Pixel, Pixel, Pixel, Pixel]  # from its lower left, counter-clockwise as seen
-    size: Distance  # [m], of its black square
+    size: Distance  # [m], of the black square
     position: Point  # [m], in the body's frame at the exposure
     orientation: Quaternion  # x, y, z, w, in the body's frame
     in_map: Point | None = None  # [m]
@@ -53,7 +53,7 @@ class TagDetection(Record, frozen=True, kw_only=True):
 
 
 class Detections(Message, frozen=True, kw_only=True):
-    """Everything that was recognised in one picture. Its basis is that of the exposure."""
+    """All objects and tags recognised in one picture. The basis is the tick of the exposure."""
 
     camera: CameraName
     width: Side  # [px], of the picture
@@ -64,11 +64,11 @@ class Detections(Message, frozen=True, kw_only=True):
 
 
 class MapObject(Record, frozen=True, kw_only=True):
-    """A thing that stands in the map."""
+    """An object in the map."""
 
     id: Count
     label: Label
-    x: Coordinate  # [m], its middle
+    x: Coordinate  # [m], of the middle
     y: Coordinate  # [m]
     z: Coordinate  # [m], from the floor
     size: Extent
@@ -78,39 +78,39 @@ class MapObject(Record, frozen=True, kw_only=True):
 
 
 class MapTag(Record, frozen=True, kw_only=True):
-    """An AprilTag that hangs in the map."""
+    """An AprilTag in the map."""
 
     id: TagId
     x: Coordinate  # [m]
     y: Coordinate  # [m]
     z: Coordinate  # [m], from the floor
-    yaw: Angle  # [rad], where its face looks
+    yaw: Angle  # [rad], direction of its face
     size: Distance  # [m], of its black square
     seen: Count = 1  # pictures
     last_seen_ns: Count = 0  # Unix time, for people
 
 
 class ObjectMap(Message, frozen=True, kw_only=True):
-    """A memory of what stands where in the map. The last value is kept for late joiners."""
+    """The remembered objects and tags of the map. The last value is kept for late joiners."""
 
     objects: Annotated[tuple[MapObject, ...], Meta(max_length=256)] = ()
     tags: Annotated[tuple[MapTag, ...], Meta(max_length=256)] = ()
-    map: Name = ""  # the saved map that it is kept with; empty for a growing one
-    recognizing: bool = False  # detections have come within the last seconds
+    map: Name = ""  # saved map that they belong to; empty for a growing one
+    recognizing: bool = False  # detections arrived within the last seconds
 
 
 class SeenSolid(Record, frozen=True, kw_only=True):
-    """A thing that stands near an arm, by its shape. What is not seen of it is guessed."""
+    """The shape of an object near an arm. Unseen parts are guessed."""
 
-    id: Count  # the same for as long as it is known
+    id: Count  # the same as long as the object is known
     shape: Literal["box", "cylinder", "sphere"]  # cylinders stand upright
     size: Annotated[tuple[Length, ...], Meta(min_length=1, max_length=3)]
     # [m]: of a box x, y, z; of a cylinder radius, height; of a sphere its radius
     position: Point  # [m], of its middle, in the body's frame at the message's basis
     yaw: Angle = 0.0  # [rad] of a box
-    label: Name = ""  # its class, where it was recognised
+    label: Name = ""  # class, if recognised
     seen: Count = 1  # pictures
-    age: Seconds = 0.0  # [s] since it was seen last
+    age: Seconds = 0.0  # [s] since the object was last seen
 
     def __post_init__(self) -> None:
         if len(self.size) != SIZES[self.shape]:

@@ -22,7 +22,7 @@ Figure = Annotated[int, Meta(ge=-(2**63), le=2**63 - 1)]
 
 
 class EstopRequest(Message, frozen=True, kw_only=True):
-    """Stop at once, and stay stopped until a person releases it. It may be empty."""
+    """Stop at once, and latch until a person releases the robot. The request may be empty."""
 
     source: Name = "anonymous"
     reason: Text = ""
@@ -31,20 +31,20 @@ class EstopRequest(Message, frozen=True, kw_only=True):
 class ReleaseRequest(Message, frozen=True, kw_only=True):
     """Release a latched gate. The robot moves only after an enable as well."""
 
-    estop_generation: Count  # as seen in robot/state, so that no stop is released unseen
+    estop_generation: Count  # from robot/state, so that no newer e-stop is released
     source: Name = "anonymous"
 
 
 class EnableRequest(Message, frozen=True, kw_only=True):
-    """Open the gate for the commands of one source."""
+    """Let one source drive."""
 
     source: Name  # "control" for the robot's own brain
-    take: bool = False  # even if another source holds the body
-    by: Name = ""  # the person who asks, if the source is the brain
+    take: bool = False  # also if another source drives
+    by: Name = ""  # the person, if the source is the brain
 
 
 class LimpRequest(Message, frozen=True, kw_only=True):
-    """Let go of all joints, which may fall; or hold them again, where they are then."""
+    """Switch the torque of all joints off, so that they may fall; or on again, to hold them."""
 
     limp: bool
     source: Name = "anonymous"
@@ -64,26 +64,26 @@ class MapRequest(Message, frozen=True, kw_only=True):
 
     name: Annotated[
         str, Meta(pattern=r"^(?!.*\.(ya?ml|zones)$)\w[\w.-]*$(?!\n)", max_length=64)
-    ]  # of its files, without ending
-    replace: bool = False  # another map of that name
+    ]  # of the files, without suffix
+    replace: bool = False  # overwrite a map of that name
     source: Name = "anonymous"
 
 
 class MapReply(Message, frozen=True, kw_only=True):
-    """The result of saving a map, with its place."""
+    """The result of saving a map, with its path."""
 
     ok: bool
     text: Text  # a sentence for people
 
 
 class PoseRequest(Message, frozen=True, kw_only=True):
-    """Look for the robot at a pose in its map, as RViz's 2D Pose Estimate does."""
+    """Localize the robot near a pose in its map, as RViz's 2D Pose Estimate does."""
 
     x: Coordinate  # [m]
     y: Coordinate  # [m]
     yaw: Angle | None = None  # [rad]; None for any
+    # of x, y, yaw, 9 values by row; empty: that of a person's estimate
     covariance: Annotated[tuple[Finite, ...], Meta(max_length=9)] = ()
-    # of x, y, yaw, 9 values by row; empty: that of what a person says
     source: Name = "anonymous"
 
     def __post_init__(self) -> None:
@@ -92,7 +92,7 @@ class PoseRequest(Message, frozen=True, kw_only=True):
 
 
 class PoseReply(Message, frozen=True, kw_only=True):
-    """The answer to a PoseRequest. It is `ok` if the robot is looked for there."""
+    """The answer to a PoseRequest. It is `ok` if localization starts there."""
 
     ok: bool
     text: Text  # a sentence for people
@@ -102,12 +102,12 @@ class DescribeRequest(Message, frozen=True, kw_only=True):
     """Ask a process for its description. The request may be empty."""
 
 
-# Asks who else has its name; works; has asked again for some seconds.
+# Checks if its name is free; works; has checked again for some seconds.
 Claim = Literal["starting", "working", "settled"]
 
 
 class Description(Message, frozen=True, kw_only=True):
-    """A process, and figures that only it knows."""
+    """A process, with figures that only it knows."""
 
     process: Name
     pid: Count
@@ -115,19 +115,19 @@ class Description(Message, frozen=True, kw_only=True):
     version: Name
     publishes: Keys = ()
     subscribes: Keys = ()
-    instance: Count = 0  # drawn at random at each start
-    claim: Claim = "settled"  # to its name
+    instance: Count = 0  # random number of this start
+    claim: Claim = "settled"  # state of the claim to its name
+    # a simulation reports its ground truth here
     report: Annotated[dict[Key, Finite | Figure | Text | None], Meta(max_length=256)] = field(
         default_factory=dict
     )
-    # of a simulation: its truth, for reports only
 
 
 class ParamRequest(Message, frozen=True, kw_only=True):
     """Change a parameter of a running process. An empty request only lists all."""
 
     name: Name = ""  # of the parameter to change
-    value: Text = ""  # as people type it
+    value: Text = ""  # as text
     source: Name = "anonymous"
 
 
@@ -135,10 +135,10 @@ class Param(Record, frozen=True, kw_only=True):
     """A parameter that may change while a process runs."""
 
     name: Name
-    value: Text  # as it is now
-    expected: Text  # what it may be, in words
-    key: Name = ""  # its dotted place in a deployment file; empty if it has none
-    initial: Text = ""  # its value when the process started
+    value: Text  # the present one
+    expected: Text  # allowed values, in words
+    key: Name = ""  # dotted path in a deployment file; empty if it has none
+    initial: Text = ""  # value at the start of the process
 
 
 class ParamReply(Message, frozen=True, kw_only=True):

@@ -1,4 +1,4 @@
-"""The state of safety, of an e-stop button, of each process, and its log."""
+"""State of safety and of an e-stop button, health of processes, and log records."""
 
 from typing import Annotated, Literal
 
@@ -25,34 +25,34 @@ Counts = Annotated[dict[Key, Count], Meta(max_length=256)]
 
 
 class SpeedCaps(Record, frozen=True, kw_only=True):
-    """Greatest speeds in each direction now; None for no limit."""
+    """Present maximum speed in each direction; None for no limit."""
 
     forward: SpeedCap | None = None  # [m/s]
     backward: SpeedCap | None = None  # [m/s]
     left: SpeedCap | None = None  # [m/s]
     right: SpeedCap | None = None  # [m/s]
-    rotation: SpeedCap | None = None  # [rad/s], either way
-    turn_left: SpeedCap | None = None  # [rad/s], where turning one way is the danger
+    rotation: SpeedCap | None = None  # [rad/s], in both directions
+    turn_left: SpeedCap | None = None  # [rad/s], if only one direction is limited
     turn_right: SpeedCap | None = None  # [rad/s]
 
 
 class JointCap(Record, frozen=True, kw_only=True):
-    """Greatest speeds of a joint each way now, away from and towards what it must not touch."""
+    """Present maximum speeds of a joint in both directions."""
 
     name: JointName
-    rise: SpeedCap | None = None  # [rad/s] or [m/s]; None for no limit
-    fall: SpeedCap | None = None  # [rad/s] or [m/s], of a position that decreases
+    rise: SpeedCap | None = None  # [rad/s] or [m/s], as the position increases; None for no limit
+    fall: SpeedCap | None = None  # [rad/s] or [m/s], as the position decreases
 
 
 class SafetyState(Message, frozen=True, kw_only=True):
-    """The verdict of the safety process. The gate obeys it, and stops when it falls silent."""
+    """The verdict of the safety process. The gate obeys it, and stops without it."""
 
     verdict: Literal["ok", "slow", "stop"]
     caps: SpeedCaps = SpeedCaps()
+    # joints with a limit
     joints: Annotated[tuple[JointCap, ...], Meta(max_length=MAX_ARM_JOINTS)] = ()
-    # of those that have a limit
-    causes: Causes = ()  # why the verdict is what it is
-    warnings: Causes = ()  # become causes if no one acts
+    causes: Causes = ()  # reasons of the verdict
+    warnings: Causes = ()  # they become causes if nobody acts
 
 
 class Health(Message, frozen=True, kw_only=True):
@@ -62,14 +62,14 @@ class Health(Message, frozen=True, kw_only=True):
     pid: Count
     host: Name
     uptime_s: NonNegative
-    cpu: NonNegative  # of one core, since the last report
+    cpu: NonNegative  # share of one core, since the last report
     rss_bytes: Count
     received_hz: Figures  # per key, since the last report
     sent_hz: Figures
     rejected: Counts  # per key, since the start
     latency_ms: Figures  # named figures, since the last report
     counters: Counts  # named counts, since the start
-    problems: Annotated[tuple[Cause, ...], Meta(max_length=16)] = ()  # what it cannot do now
+    problems: Annotated[tuple[Cause, ...], Meta(max_length=16)] = ()  # present ones
 
 
 class LogRecord(Message, frozen=True, kw_only=True):
@@ -83,7 +83,7 @@ class LogRecord(Message, frozen=True, kw_only=True):
 
 
 class ButtonState(Message, frozen=True, kw_only=True):
-    """State of an e-stop button. Where one is required, its silence counts as a press."""
+    """State of an e-stop button. If a button is required, its silence counts as a press."""
 
-    pressed: bool  # also when nothing is known of the contact
+    pressed: bool  # also if the contact is unknown
     text: Text = ""  # why it counts as pressed

@@ -17,10 +17,10 @@ Turning = Annotated[float, Meta(ge=-1000.0, le=1000.0)]  # [rad/s]
 Acceleration = Annotated[float, Meta(ge=-10_000.0, le=10_000.0)]  # [m/s2]
 Turnings = tuple[Turning, Turning, Turning]
 Accelerations = tuple[Acceleration, Acceleration, Acceleration]
-Part = Annotated[float, Meta(ge=-2.0, le=2.0)]  # of a quaternion of about unit length
+Part = Annotated[float, Meta(ge=-2.0, le=2.0)]  # component of a quaternion of about unit length
 Quaternion = tuple[Part, Part, Part, Part]
 Pixels = Annotated[int, Meta(ge=0, le=16_384)]
-MIN_STEP = 1e-6  # [rad], from beam to beam
+MIN_STEP = 1e-6  # [rad], between beams
 
 
 class LaserScan(Message, frozen=True, kw_only=True):
@@ -31,9 +31,9 @@ class LaserScan(Message, frozen=True, kw_only=True):
     angle_increment: BeamStep  # [rad]
     range_min: Range  # [m]
     range_max: RangeMax  # [m]
+    # float32 little-endian [m], (n,); inf without a hit, nan if unknown
     ranges: Annotated[bytes, array_meta(64 * 1024, "float32", ("n",), "m")]
-    # float32 little-endian [m], (n,); inf where nothing was hit, nan where unknown
-    late_ms: Milliseconds = 0.0  # how much later than it can it came; 0 without stamps
+    late_ms: Milliseconds = 0.0  # delay beyond the shortest one; 0 without stamps
 
     def __post_init__(self) -> None:
         if not self.ranges or len(self.ranges) % 4:
@@ -59,7 +59,7 @@ class LaserScan(Message, frozen=True, kw_only=True):
         return self.angle_min + self.angle_increment * beams
 
     def points(self) -> "NDArray[np.float64]":
-        """Return where beams hit something [m], (k, 2), in the sensor's frame."""
+        """Return the points that beams hit [m], (k, 2), in the sensor's frame."""
         import numpy as np
 
         ranges, angles = self.ranges_m.astype(np.float64), self.angles
@@ -71,7 +71,7 @@ class LaserScan(Message, frozen=True, kw_only=True):
 class ImuData(Record, frozen=True, kw_only=True):
     """Attitude, turn rate and acceleration of the body."""
 
-    orientation: Quaternion  # x, y, z, w; all 0 where it is not known
+    orientation: Quaternion  # x, y, z, w; all 0 if unknown
     angular_velocity: Turnings  # [rad/s]
     linear_acceleration: Accelerations  # [m/s2], +9.81 on z at rest
 
@@ -80,7 +80,7 @@ class Imu(Message, frozen=True, kw_only=True):
     """One reading of the inertial measurement unit."""
 
     frame_id: Name = "imu_link"
-    orientation: Quaternion  # x, y, z, w; all 0 where it is not known
+    orientation: Quaternion  # x, y, z, w; all 0 if unknown
     angular_velocity: Turnings  # [rad/s]
     linear_acceleration: Accelerations  # [m/s2]
 
@@ -104,8 +104,8 @@ class Image(Message, frozen=True, kw_only=True):
     encoding: Literal["jpeg", "rgb8", "bgr8", "mono8", "depth16", "depth32f"]
     height: Pixels  # [px]
     width: Pixels  # [px]
-    data: Annotated[bytes, array_meta(1024 * 1024, PIXEL_TYPES, IMAGE_SHAPES)]
     # row by row, little-endian
+    data: Annotated[bytes, array_meta(1024 * 1024, PIXEL_TYPES, IMAGE_SHAPES)]
 
     def __post_init__(self) -> None:
         if not self.data:

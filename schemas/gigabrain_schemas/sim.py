@@ -8,7 +8,7 @@ from gigabrain_schemas.base import Coordinate, Count, Key, Message, Name, Pose, 
 from gigabrain_schemas.base import array_meta as array
 
 MAX_SHAPES, MAX_BODIES = 20_000, 1_000
-MAX_MESHES, MAX_MESH_BYTES = 1_000, 4 * 1024 * 1024  # of a scene; bytes of all together
+MAX_MESHES, MAX_MESH_BYTES = 1_000, 4 * 1024 * 1024  # of a scene; bytes of all meshes together
 ShapeKind = Literal["plane", "box", "cylinder", "sphere", "capsule", "ellipsoid", "mesh"]
 SHAPE_KINDS: tuple[ShapeKind, ...] = get_args(ShapeKind)
 ThingKind = Literal["box", "cylinder", "person"]
@@ -21,40 +21,40 @@ class SceneMesh(Record, frozen=True, kw_only=True):
     """A mesh of triangles, in its own frame."""
 
     vertices: Annotated[bytes, array(MAX_MESH_BYTES, "float32", ("n", 3), "m")]
-    faces: Annotated[bytes, array(MAX_MESH_BYTES, "uint32", ("m", 3))]  # numbers of vertices
+    faces: Annotated[bytes, array(MAX_MESH_BYTES, "uint32", ("m", 3))]  # indices of vertices
 
 
 class Thing(Record, frozen=True, kw_only=True):
-    """Something that a person has put into a simulated world. In the world's frame."""
+    """An object that a person added to a simulated world, in the world's frame."""
 
     kind: ThingKind = "box"
-    name: ThingName = ""  # empty in a request: one is chosen
+    name: ThingName = ""  # if empty in a request, one is chosen
     x: Coordinate = 0.0  # [m]
     y: Coordinate = 0.0  # [m]
     yaw: Annotated[float, Meta(ge=-10.0, le=10.0)] = 0.0  # [rad]
     size: tuple[Extent, Extent, Extent] = (0.3, 0.3, 0.5)
-    # [m], along its own x and y, and its height; x and y are a cylinder's diameter; no person's
+    # [m], along its own x and y, and height; x and y are a cylinder's diameter; not for persons
     path: Annotated[tuple[tuple[Coordinate, Coordinate], ...], Meta(max_length=16)] = ()
-    # [m], where a person walks to from its place, and back; empty: it stands
+    # [m], points that a person walks to, and back; empty: the person stands
     speed: Annotated[float, Meta(ge=0.05, le=3.0)] = 0.8  # [m/s], of a person
 
 
 class SimScene(Message, frozen=True, kw_only=True):
-    """The shapes of a simulated world, for viewers. The robot itself does not look at it.
+    """The shapes of a simulated world, for viewers. The robot itself does not use them.
 
-    Body 0 does not move; those behind it are where the newest SimPoses of this version has them.
-    A thing's body has its name.
+    Body 0 does not move; the newest SimPoses of this version has the poses of the others. The body
+    of a thing has its name.
     """
 
-    version: Count  # counts its changes
+    version: Count  # number of changes
     world: Key  # name or file
     bodies: Annotated[tuple[SceneName, ...], Meta(min_length=1, max_length=MAX_BODIES)]
-    kinds: Annotated[bytes, array(MAX_SHAPES, "uint8", ("n",))]  # numbers in SHAPE_KINDS
-    owners: Annotated[bytes, array(2 * MAX_SHAPES, "uint16", ("n",))]  # numbers in `bodies`
+    kinds: Annotated[bytes, array(MAX_SHAPES, "uint8", ("n",))]  # indices in SHAPE_KINDS
+    owners: Annotated[bytes, array(2 * MAX_SHAPES, "uint16", ("n",))]  # indices in `bodies`
     sizes: Annotated[bytes, array(12 * MAX_SHAPES, "float32", ("n", 3), "m")]
-    # half the size of a box or an ellipsoid; radius, half the length; of a mesh its number
+    # [m], half sizes of a box or an ellipsoid; radius and half length; index of a mesh
     places: Annotated[bytes, array(28 * MAX_SHAPES, "float32", ("n", 7), "m")]
-    # on its body: x, y, z, and a quaternion w, x, y, z
+    # [m], in the frame of its body: x, y, z, and a quaternion w, x, y, z
     colours: Annotated[bytes, array(4 * MAX_SHAPES, "uint8", ("n", 4))]  # red, green, blue, alpha
     meshes: Annotated[tuple[SceneMesh, ...], Meta(max_length=MAX_MESHES)] = ()
     things: Annotated[tuple[Thing, ...], Meta(max_length=64)] = ()
@@ -67,15 +67,15 @@ class SimScene(Message, frozen=True, kw_only=True):
 
 
 class SimPoses(Message, frozen=True, kw_only=True):
-    """The poses of the bodies of a SimScene, by the physics. The robot itself does not use them."""
+    """The true poses of the bodies of a SimScene. The robot itself does not use them."""
 
     version: Count  # of the scene
     poses: Annotated[bytes, array(28 * MAX_BODIES, "float32", ("n", 7), "m")]
-    # of bodies[1:]: x, y, z, and a quaternion w, x, y, z
+    # [m], of bodies[1:]: x, y, z, and a quaternion w, x, y, z
 
 
 class SimRequest(Message, frozen=True, kw_only=True):
-    """Put something into a simulated world, or take it out. An empty request lists what is in."""
+    """Add a thing to a simulated world, or remove one. An empty request lists all."""
 
     do: Literal["list", "add", "remove"] = "list"
     thing: Thing | None = None  # to add
@@ -84,7 +84,7 @@ class SimRequest(Message, frozen=True, kw_only=True):
 
 
 class SimReply(Message, frozen=True, kw_only=True):
-    """The answer to a SimRequest, and what is in the world now."""
+    """The answer to a SimRequest, with the present things."""
 
     ok: bool
     text: Text  # a sentence for people

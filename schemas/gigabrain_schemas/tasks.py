@@ -18,14 +18,14 @@ from gigabrain_schemas.base import (
 from gigabrain_schemas.objects import TagId
 
 How = Literal["replace", "queue", "preempt"]
-# in place of all that there is to do; after it; or before it, which goes on afterwards
+# instead of all tasks; after them; or before them, which then go on
 TaskState = Literal["queued", "active", "paused", "succeeded", "failed", "cancelled"]
-MAX_REQUEST_BYTES = 96 * 1024  # of a request as text: a mission of the longest, quoted
+MAX_REQUEST_BYTES = 96 * 1024  # of a request as text, with the longest mission
 MAX_POINTS = 256  # of a path that is only drawn
 
 
 class Goal(Record, frozen=True, kw_only=True):
-    """A place to be, in the map."""
+    """A pose in the map to drive to."""
 
     x: Coordinate  # [m]
     y: Coordinate  # [m]
@@ -33,13 +33,13 @@ class Goal(Record, frozen=True, kw_only=True):
 
 
 class GoalRequest(Message, frozen=True, kw_only=True):
-    """Go there: to coordinates, a named place of the map, before an object or a tag."""
+    """Drive to coordinates, to a named place of the map, or in front of an object or a tag."""
 
     x: Coordinate | None = None  # [m], in the map
     y: Coordinate | None = None  # [m]
-    yaw: Angle | None = None  # [rad]; None for any, or for that of the place
+    yaw: Angle | None = None  # [rad]; None for any, or the heading of the place
     place: Name = ""  # instead of x and y; see robot/zones
-    object: Name = ""  # the class of one, such as can; see robot/objects
+    object: Name = ""  # class of an object, such as can; see robot/objects
     tag: TagId | None = None
     how: How = "replace"
     source: Name = "anonymous"
@@ -55,7 +55,7 @@ class GoalReply(Message, frozen=True, kw_only=True):
 
     ok: bool
     text: Text
-    goal: Name = ""  # the task's name, to follow and to cancel it by
+    goal: Name = ""  # id of the task, to follow or cancel it
 
 
 class MissionRequest(Message, frozen=True, kw_only=True):
@@ -64,7 +64,7 @@ class MissionRequest(Message, frozen=True, kw_only=True):
     mission: Annotated[str, Meta(max_length=MAX_REQUEST_BYTES)]  # the YAML text
     how: How = "replace"
     source: Name = "anonymous"
-    label: Name = "mission"  # what people call it; stands for the file's name in errors
+    label: Name = "mission"  # name for people; errors show it as the file's name
 
 
 class MissionReply(Message, frozen=True, kw_only=True):
@@ -72,14 +72,14 @@ class MissionReply(Message, frozen=True, kw_only=True):
 
     ok: bool
     text: Text
-    task: Name = ""  # the task's name, to follow and to cancel it by
+    task: Name = ""  # id of the task, to follow or cancel it
 
 
 class TaskRequest(Message, frozen=True, kw_only=True):
-    """Change what the robot is at."""
+    """Cancel, pause or resume a task."""
 
     do: Literal["cancel", "pause", "resume"]
-    task: Name = ""  # which one; without, the present one; "all" to cancel whatever there is
+    task: Name = ""  # id; empty for the present one; "all" to cancel all
     source: Name = "anonymous"
 
 
@@ -92,29 +92,29 @@ class TaskReply(Message, frozen=True, kw_only=True):
 
 
 class Task(Record, frozen=True, kw_only=True):
-    """One thing that the robot was sent to do."""
+    """A goal or mission of the robot."""
 
     id: Name
     kind: Literal["goal", "mission"]
     label: Name
-    source: Name  # who wanted it
+    source: Name  # of the request
     state: TaskState
-    reason: Text = ""  # in words: why it waits, what became of it
-    position_error: NonNegative | None = None  # [m] from the goal where it ended; None if unknown
-    heading_error: NonNegative | None = None  # [rad]; None where the goal has no heading
+    reason: Text = ""  # in words: why it waits, or how it ended
+    position_error: NonNegative | None = None  # [m] from the goal at the end; None if unknown
+    heading_error: NonNegative | None = None  # [rad]; None if the goal has no heading
 
 
 class TaskStatus(Message, frozen=True, kw_only=True):
     """The current task, the queue, and the last tasks."""
 
     current: Task | None = None  # active or paused
-    doing: Text = ""  # the step that it is at, in words
-    drives: bool = False  # whether that step wants the robot to drive
+    doing: Text = ""  # present step, in words
+    drives: bool = False  # the step needs the robot to drive
     progress: Fraction = 0.0  # of that step
-    distance_remaining: Distance | None = None  # [m] along the path; None while none is known
+    distance_remaining: Distance | None = None  # [m] along the path; None if unknown
     eta: NonNegative | None = None  # [s] until the step is done
-    goal: Goal | None = None  # where it drives to now
+    goal: Goal | None = None  # present goal of the drive
     path: Annotated[tuple[tuple[Coordinate, Coordinate], ...], Meta(max_length=MAX_POINTS)] = ()
-    # [m] in the map, from here to the goal, for drawing
+    # [m] in the map, from the robot to the goal, for drawing
     queue: Annotated[tuple[Task, ...], Meta(max_length=32)] = ()
     done: Annotated[tuple[Task, ...], Meta(max_length=16)] = ()  # the last ones, newest first

@@ -1,6 +1,6 @@
 """The one table of topics and services: type, rate, limits, rights and drawing of each.
 
-A line here is all that a topic takes, beside an example of its message in the folder `golden`.
+A new topic needs a line here, and an example of its message in the folder `golden`.
 """
 
 from dataclasses import dataclass, replace
@@ -44,45 +44,45 @@ class Topic(Generic[M]):
 
     key: str  # Zenoh key expression, below the robot's namespace
     type: type[M]
-    hz: float  # promised rate, which decides how long a value counts
-    missed: float = 5.0  # periods without a message after which the last one no longer counts
-    echo_ns: int = 0  # age up to which a tick may be echoed, where the way is longer than `missed`
+    hz: float  # promised rate, which decides how long a value is fresh
+    missed: float = 5.0  # periods until the last message is stale
+    echo_ns: int = 0  # maximum age of an echoed tick, if longer than `missed` allows
     priority: Priority = "data"
     congestion: Literal["drop", "block"] = "drop"
     express: bool = False  # not batched: for small messages that must not wait
     keep: bool = False  # the last value is kept for late joiners
-    depth: int = 1  # messages of a key that wait for a busy reader; the oldest are dropped
-    max_bytes: int = 4 * KB  # larger ones are not even decoded
+    depth: int = 1  # messages per key that wait for a busy reader; then the oldest are dropped
+    max_bytes: int = 4 * KB  # larger messages are not decoded
     many: bool = False  # one key per camera or process below this one
-    publishers: tuple[Role, ...] = ()  # may publish it, besides the robot itself
+    publishers: tuple[Role, ...] = ()  # roles that may publish it, besides the robot itself
     drawing: Drawing | None = None
     plotted: bool = False  # viewers plot its numbers
 
     @property
     def stale_after_ns(self) -> int:
-        """Return the age from which the newest message no longer counts [ns]."""
+        """Return the age from which the newest message is stale [ns]."""
         return round(self.missed / self.hz * 1e9)
 
     def at(self, name: str = "") -> str:
-        """Return the key of this topic; of the camera or process `name` if there are many."""
+        """Return the key of this topic; with `many`, for the camera or process `name`."""
         return f"{self.key}/{name}" if self.many else self.key
 
 
 @dataclass(frozen=True, slots=True)
 class Service(Generic[Q, R]):
-    """A named question and its answer."""
+    """A named request and its reply."""
 
     key: str
     request: type[Q]
     reply: type[R]
     priority: Priority = "interactive_high"
-    max_bytes: int = 64 * KB  # of the request and of each reply; larger ones are not even decoded
+    max_bytes: int = 64 * KB  # of the request and of each reply; larger ones are not decoded
     many: bool = False  # one key per process below this one
-    callers: tuple[Role, ...] = ()  # may ask it, besides the robot itself
-    servers: tuple[Role, ...] = ()  # may answer it, besides the robot itself
+    callers: tuple[Role, ...] = ()  # roles that may call it, besides the robot itself
+    servers: tuple[Role, ...] = ()  # roles that may answer it, besides the robot itself
 
     def at(self, name: str = "") -> str:
-        """Return the key of this service; at the process `name` if there are many."""
+        """Return the key of this service; with `many`, for the process `name`."""
         return f"{self.key}/{name}" if self.many else self.key
 
 
@@ -171,7 +171,7 @@ SAFETY = Topic(
     "robot/safety", safety.SafetyState, 20, missed=3, priority="interactive_high",
     max_bytes=16 * KB, plotted=True,
 )  # fmt: skip
-# real_time is for what stops the robot, and for nothing that a client may send by the thousand
+# real_time is for messages that stop the robot, and not for those that a client may send in masses
 BUTTON = Topic(
     "robot/button", safety.ButtonState, 20, missed=4, priority="real_time", express=True,
     max_bytes=KB, publishers=OPERATOR,
@@ -213,7 +213,7 @@ OLD_KEYS = {"robot/heard": INPUT_LOG.key, "robot/granted": REQUEST_LOG.key}  # u
 
 
 def current_key(key: str) -> str:
-    """Return the present key for one that a recording of an older release holds."""
+    """Return the present key for a `key` in a recording of an older release."""
     start, _, rest = key.removeprefix("robot/").partition("/")
     new = OLD_KEYS.get(f"robot/{start}")
     return f"{new}/{rest}" if new and rest else new or key
@@ -222,7 +222,7 @@ def current_key(key: str) -> str:
 ESTOP = Service(
     "robot/estop", requests.EstopRequest, requests.GateReply, priority="real_time", callers=BOTH,
 )  # fmt: skip
-# for clients that can publish but not query: it stops just the same, and nothing is confirmed
+# for clients that can publish but not query: it also stops the robot, without a reply
 ESTOP_SAID = Topic(
     ESTOP.key, requests.EstopRequest, 10, priority="real_time", congestion="block", express=True,
     depth=16, max_bytes=KB, publishers=BOTH,
@@ -276,6 +276,6 @@ SERVICES: tuple[Service[Any, Any], ...] = tuple(
 
 
 def messages() -> tuple[type[Message], ...]:
-    """Return every message type that a topic or a service carries, once."""
+    """Return the message types of all topics and services, each once."""
     asked = (side for service in SERVICES for side in (service.request, service.reply))
     return tuple(dict.fromkeys((*(topic.type for topic in TOPICS), *asked)))

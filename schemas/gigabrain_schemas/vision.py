@@ -19,9 +19,9 @@ Plane = Annotated[bytes, Meta(max_length=MAX_PLANE_BYTES)]
 class DepthImage(Message, frozen=True, kw_only=True):
     """The depth of each pixel along the camera's axis [mm]; 0 is unknown. Compressed without loss.
 
-    It comes as four planes, each a quarter of the picture: of every block of two by two pixels the
-    first one, the second one, and so on by row. The first plane alone is the picture at half the
-    width and height, for readers that cannot wait. A plane is uint16 by row, compressed by zlib.
+    It has four planes, each with one pixel of every block of two by two pixels, in the order of
+    rows. So the first plane is the picture at half its width and height, for readers in a hurry.
+    A plane is uint16 by row, compressed by zlib.
     """
 
     frame_id: Name
@@ -60,7 +60,7 @@ def _unpacked(data: bytes, height: int, width: int) -> "NDArray[np.uint16]":
     size = 2 * height * width
     unpacker = zlib.decompressobj()
     try:
-        plain = unpacker.decompress(data, size + 1)  # no more than it may be: no bomb
+        plain = unpacker.decompress(data, size + 1)  # limited, against zip bombs
     except zlib.error as error:
         raise ValueError(f"a plane of depth cannot be unpacked: {error}") from None
     if len(plain) != size or not unpacker.eof:
@@ -69,8 +69,8 @@ def _unpacked(data: bytes, height: int, width: int) -> "NDArray[np.uint16]":
 
 
 class CameraInfo(Message, frozen=True, kw_only=True):
-    """The model and mounting pose of a camera. The last value is kept for those who join late."""
+    """The model and mounting pose of a camera. The last value is kept for late joiners."""
 
     camera: Camera
-    source: CameraName = "mujoco"  # what its pictures come from
-    problem: Text = ""  # why it gives no pictures now: covered, frozen, no picture
+    source: CameraName = "mujoco"  # source of its pictures
+    problem: Text = ""  # why it has no pictures now: covered, frozen, no picture

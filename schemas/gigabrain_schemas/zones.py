@@ -19,7 +19,7 @@ MAX_ALL_VERTICES = 8192  # of all zones together
 MAX_ZONES = 256
 MAX_PLACES = 256
 
-# letters, digits, spaces, - _ and . ; the first is none of the last four
+# letters, digits, spaces, - _ and . ; the first character is a letter, digit or _
 Label = Annotated[str, Meta(pattern=r"^\w[\w .-]*$(?!\n)", max_length=64)]
 ZoneKind = Literal["keepout", "speed", "one_way"]
 Vertex = tuple[Coordinate, Coordinate]  # [m], in the map
@@ -28,13 +28,13 @@ LaneWidth = Annotated[float, Meta(ge=0.05, le=100.0)]  # [m]
 
 
 class Zone(Record, frozen=True, kw_only=True):
-    """An area of the map with a rule: the polygon `points`, or the middle of a lane."""
+    """An area of the map with a rule: the polygon `points`, or a lane with this middle line."""
 
     name: Label
     kind: ZoneKind
     points: Annotated[tuple[Vertex, ...], Meta(min_length=2, max_length=MAX_VERTICES)]
     max_speed: ZoneSpeed | None = None  # [m/s], of a speed zone
-    lane_width: LaneWidth | None = None  # [m], of a one-way lane; it leads from the first point on
+    lane_width: LaneWidth | None = None  # [m], of a one-way lane from the first point to the last
 
     def __post_init__(self) -> None:
         if self.kind != "one_way" and len(self.points) < 3:
@@ -63,19 +63,19 @@ class Zones(Message, frozen=True, kw_only=True):
 
     zones: ZoneList = ()
     places: PlaceList = ()
-    map: Name = ""  # the saved map that they are kept with; empty for a growing one
-    maps_loaded: Count = 0  # while the robot runs; after a change coordinates mean other places
+    map: Name = ""  # saved map that they belong to; empty for a growing one
+    maps_loaded: Count = 0  # since the start; another map makes old coordinates invalid
 
     def __post_init__(self) -> None:
         check_zones(self.zones, self.places)
 
     def place(self, name: str) -> Place | None:
-        """Return the place called `name`."""
+        """Return the place `name`; None if there is none."""
         return next((one for one in self.places if one.name == name), None)
 
 
 def check_zones(zones: tuple[Zone, ...], places: tuple[Place, ...]) -> None:
-    """Raise ValueError for two of one name, and for too many vertices."""
+    """Raise ValueError for duplicate names, and for too many vertices."""
     seen: set[str] = set()
     for name in (*(one.name for one in zones), *(one.name for one in places)):
         if name in seen:
@@ -91,7 +91,7 @@ class ZonesRequest(Message, frozen=True, kw_only=True):
     zone: Zone | None = None
     place: Place | None = None
     remove: Name = ""
-    replace: bool = False  # another one of the same name
+    replace: bool = False  # overwrite one of the same name
     source: Name = "anonymous"
 
     def __post_init__(self) -> None:
@@ -127,12 +127,12 @@ class MapListReply(Message, frozen=True, kw_only=True):
     """The saved maps, by name."""
 
     maps: Annotated[tuple[SavedMapInfo, ...], Meta(max_length=256)] = ()
-    present: Name = ""  # the one in use
+    present: Name = ""  # name of the map in use
     text: Text = ""  # a sentence for people, if there are too many
 
 
 class MapLoadRequest(Message, frozen=True, kw_only=True):
-    """Use a saved map from now on: find the robot in it, and continue it if asked to."""
+    """Use a saved map: localize the robot in it, and with `slam` continue mapping."""
 
     name: Annotated[str, Meta(pattern=r"^(?!.*\.(ya?ml|zones)$)\w[\w.-]*$(?!\n)", max_length=64)]
     mapping: Literal["localize", "slam"] = "localize"
