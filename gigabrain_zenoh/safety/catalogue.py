@@ -6,7 +6,7 @@ from msgspec.structs import replace
 
 from gigabrain_schemas.base import TICK_NS, Cause
 
-MAX_STEP_TICKS = 5  # that one state can count for, after any gap
+MAX_STEP_TICKS = 5  # maximum that one state counts for, after any gap
 
 
 def _causes(*rows: tuple[str, str, str], latching: bool = False) -> dict[str, Cause]:

@@ -296,7 +296,7 @@ class DataLatency(Struct, frozen=True, kw_only=True):
     def _doubtful(self, state: RobotState, late_ms: float, elapsed: int) -> "DataLatency":
         """Forget the known latency after a silence, unless the device's clock measures it.
 
-        A line cannot become late without a silence of the same length. After one the body slows
+        A line cannot become late without a silence of the same length. After it the body slows
         down, and this change of speed shows the latency.
         """
         silent_ms = state.link.age_ms
