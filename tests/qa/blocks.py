@@ -1,16 +1,16 @@
-"""The fenced blocks of README.md and docs/, and what their comments say about them.
+"""Reads the fenced blocks of README.md and docs/, and the comments before them.
 
     <!-- run: robot -->         run beside a robot that drives
     <!-- run: arm -->           run beside an arm
     <!-- run: 5 s -->           each line is ended by Ctrl-C after 5 s
     <!-- run: robot, 5 s -->    both
-    <!-- run: stays -->         run until the end of the page; a robot that it starts may drive
-    <!-- file: NAME -->         the block is such a file, for the blocks of the page
-    <!-- data: FOLDER/NAME -->  run with such a file of the folder GIGABRAIN_DATA
+    <!-- run: stays -->         run until the end of the page; wait until its robot may drive
+    <!-- file: NAME -->         the block is this file, for the blocks of the page
+    <!-- data: FOLDER/NAME -->  run with this file of the folder GIGABRAIN_DATA
     <!-- not run: hardware (WHAT) -->  it needs hardware, other hosts, or root
 
-Without a comment a block of `sh` or `python` is run. YAML must be a file that is read here, or a
-part of a robot.yaml. A block of `text` is output, or a drawing.
+A block of `sh` or `python` without a comment is run. YAML must be one of the known kinds of files,
+or a part of a robot.yaml. A block of `text` is output or a drawing.
 """
 
 import ast
@@ -45,7 +45,7 @@ BLOCK = re.compile(
 )
 VERBS = ("run", "not run", "file", "data")
 NOT_RUN = ("hardware (", "what CI runs itself")
-PART_OF = ROOT / "drivers/gigabrain_drivers/bodies/mycustombot"  # what a part of a robot.yaml joins
+PART_OF = ROOT / "drivers/gigabrain_drivers/bodies/mycustombot"  # completes a part of a robot.yaml
 ARM = ROOT / "drivers/gigabrain_drivers/bodies/so101"  # the same, for a part with joints
 
 
@@ -66,7 +66,7 @@ def pages() -> list[Path]:
 
 
 def blocks(page: Path) -> Iterator[Block]:
-    """Yield the blocks of a page with what their comments say."""
+    """Yield the blocks of a page with their comments."""
     text = page.read_text("utf-8")
     for found in BLOCK.finditer(text):
         verb, _, value = (found["mark"] or "").partition(": ")
@@ -76,7 +76,7 @@ def blocks(page: Path) -> Iterator[Block]:
 
 
 def problem(block: Block) -> str:
-    """Return what is wrong with a block before it is run; empty for nothing."""
+    """Return the fault of a block before it is run; empty without one."""
     if block.verb == "not run" and not block.value.startswith(NOT_RUN):
         return f"not run: expected one of {NOT_RUN}, got {block.value!r}"
     if block.language not in READERS:
@@ -109,7 +109,7 @@ def _read_part_of_robot(text: str) -> None:
     part = yaml.safe_load(text)
     with tempfile.TemporaryDirectory(prefix="docs-") as name:
         folder = Path(name) / "robot"
-        of_arm = {"arm", "joints"} & set(part) or " link: " in text  # as a camera on one has
+        of_arm = {"arm", "joints"} & set(part) or " link: " in text  # like a camera on an arm
         shutil.copytree(ARM if of_arm else PART_OF, folder)
         file = folder / "robot.yaml"
         file.write_text(yaml.safe_dump(_joined(yaml.safe_load(file.read_text()), part)))
@@ -117,7 +117,7 @@ def _read_part_of_robot(text: str) -> None:
 
 
 def _joined(whole: dict[str, Any], part: dict[str, Any]) -> dict[str, Any]:
-    """Return the fields of a robot's file with those of `part`; a link joins one of its driver."""
+    """Return a robot's fields with those of `part`; links with the same driver are merged."""
     for key, value in part.items():
         old = whole.get(key)
         if (
@@ -141,7 +141,7 @@ def _compile_c(block: Block) -> None:
 
 
 def _nothing(block: Block) -> None:
-    """Read nothing: a shell, or output."""
+    """Accept a shell block or output without reading it."""
 
 
 READERS: dict[str, Callable[[Block], Any]] = {
@@ -154,4 +154,4 @@ READERS: dict[str, Callable[[Block], Any]] = {
     "c": _compile_c,
     "text": _nothing,
 }
-RUN = ("sh", "python")  # all others are checked only
+RUN = ("sh", "python")  # all others are only checked

@@ -1,8 +1,8 @@
-"""Runs the Dockerfile's own steps without Docker: `python -m tests.qa.dockerfile_steps`, minutes.
+"""Runs the Dockerfile's steps without Docker, for minutes: `python -m tests.qa.dockerfile_steps`.
 
-The build stage's COPY and RUN go into a fresh folder, and the final stage's command is started with
-its ENV and nothing else, until its HEALTHCHECK is content. Left out are the base image, users, and
-what the final stage removes.
+COPY and RUN of the build stage go into a new folder. Then the final stage's command runs with only
+its ENV, until its HEALTHCHECK succeeds. The base image, users, and removals of the final stage are
+left out.
 """
 
 import json
@@ -19,14 +19,14 @@ from pathlib import Path
 from tests.places import ROOT
 
 DOCKERFILE = ROOT / "deploy" / "docker" / "Dockerfile"
-HEALTHY_S = 300.0  # the first start compiles
-END_S = 10.0
+HEALTHY_TIMEOUT_S = 300.0  # the first start compiles
+END_TIMEOUT_S = 10.0
 
-Step = tuple[str, str]  # instruction, and what follows it
+Step = tuple[str, str]  # instruction, and its arguments
 
 
 def stages() -> list[list[Step]]:
-    """The instructions of each stage."""
+    """Return the instructions of each stage."""
     text = re.sub(r"^#.*\n", "", DOCKERFILE.read_text(), flags=re.MULTILINE)
     lines = text.replace("\\\n", " ").splitlines()
     found: list[list[Step]] = []
@@ -39,7 +39,7 @@ def stages() -> list[list[Step]]:
 
 
 def only(steps: list[Step], word: str) -> str:
-    """Return the text after the one instruction of that kind."""
+    """Return the arguments of the only instruction of a kind."""
     (rest,) = (rest for each, rest in steps if each == word)
     return rest
 
@@ -57,7 +57,7 @@ def command() -> list[str]:
 
 
 class Image:
-    """The image's folders, each in a place of its own."""
+    """The image's folders, each in its own place."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
@@ -68,7 +68,7 @@ class Image:
         }
 
     def build(self) -> None:
-        """The build stage."""
+        """Run the build stage."""
         source, python = self._folder / "src", self._folder / "bin" / "python"
         source.mkdir()
         python.parent.mkdir()
@@ -82,7 +82,7 @@ class Image:
                 subprocess.run(run, cwd=source, env=os.environ | {"PATH": path}, check=True)
 
     def start(self) -> subprocess.Popen[bytes]:
-        """The final stage's command, as a user without a home."""
+        """Start the final stage's command, like a user without a home directory."""
         work = self._folder / "lib" / "gigabrain"
         for folder in (work, self._folder / "run"):
             folder.mkdir(mode=0o700, parents=True)
@@ -119,24 +119,24 @@ class Image:
 
 
 def fault_of(image: Image, started: subprocess.Popen[bytes]) -> str:
-    """Wait until it is healthy, then stop it. Return the fault; an empty text without one."""
-    end_s = time.monotonic() + HEALTHY_S
+    """Wait until it is healthy, then stop it. Return the fault; empty without one."""
+    end_s = time.monotonic() + HEALTHY_TIMEOUT_S
     while not image.healthy():
         if started.poll() is not None:
             return f"ended with {started.returncode}"
         if time.monotonic() > end_s:
-            return f"was not healthy within {HEALTHY_S:.0f} s"
+            return f"was not healthy within {HEALTHY_TIMEOUT_S:.0f} s"
         time.sleep(1.0)
     started.send_signal(getattr(signal, only(stages()[-1], "STOPSIGNAL")))
     try:
-        code = started.wait(END_S)
+        code = started.wait(END_TIMEOUT_S)
     except subprocess.TimeoutExpired:
-        return f"did not end within {END_S:.0f} s of its STOPSIGNAL"
+        return f"did not end within {END_TIMEOUT_S:.0f} s of its STOPSIGNAL"
     return f"ended with {code} after its STOPSIGNAL" if code else ""
 
 
 def main() -> int:
-    """Build, start, and end; 1 with a reason where one of them fails."""
+    """Build, start, and end it; return 1 if one of these fails."""
     with tempfile.TemporaryDirectory(prefix="img-") as folder:
         image = Image(Path(folder))
         image.build()

@@ -1,10 +1,10 @@
 """Runs the commands and programs of README.md and docs/: `python -m tests.qa.documentation`.
 
-A block of `sh` or `python` is run in a folder of its page, a line of `sh` at a time; `blocks.py`
-says what a comment before a block changes. A line that ends in `&` runs until the end of its block.
-Pages share a robot, which is ended before a block that starts one: robots side by side delay each
-other. Other blocks are checked. Pages may be named behind the command. Prints how many blocks were
-run, and which need hardware; ends with 1 where something fails.
+A block of `sh` or `python` runs in a folder of its page, with `sh` line by line. `blocks.py`
+describes the comments before blocks. A line that ends in `&` runs until the end of its block. Pages
+share a robot, which is stopped before a block that starts one: two robots would delay each other.
+Other blocks are checked. Arguments are the names of pages; the default is all. It prints the number
+of blocks by kind, and exits with 1 if one fails.
 """
 
 import contextlib
@@ -24,17 +24,17 @@ from pathlib import Path
 from tests.places import ROOT
 from tests.qa.blocks import RUN, Block, blocks, pages, problem
 
-LINE_S = 180.0  # for a line or a program
-JUDGES = ("gigabrain why", "gigabrain doctor")  # their exit code says what is wrong
+LINE_TIMEOUT_S = 180.0  # for a line or a program
+JUDGES = ("gigabrain why", "gigabrain doctor")  # their exit codes are results
 USAGE, INTERRUPTED = 2, 130
 MODE = "gigabrain topic echo state -n 1 --fields gate.mode"
-BODIES = {"robot": "turtlebot3_waffle", "arm": "so101"}  # what a block is run beside
+BODIES = {"robot": "turtlebot3_waffle", "arm": "so101"}  # of the robot beside a block
 STARTS_ROBOT = re.compile(r"^gigabrain (bench|demo|faults|up)\b", re.MULTILINE)
 Words = str | Sequence[str]
 
 
 class Home:
-    """The folders of a user, and a robot in them once one is asked for."""
+    """The folders of a user, and a robot in them if a block needs one."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -42,7 +42,7 @@ class Home:
         self._robot: subprocess.Popen[bytes] | None = None
 
     def environment(self, place: Path, body: str) -> dict[str, str]:
-        """Return the environment of a page in `place`; with a `body` it sees that robot."""
+        """Return the environment of a page in `place`; with `body`, that robot is found in it."""
         run = self.folder / f"run-{body}" if body else place / "run"
         run.mkdir(exist_ok=True, mode=0o700)
         return os.environ | {
@@ -55,7 +55,7 @@ class Home:
         }
 
     def robot(self, body: str) -> None:
-        """Start a robot in place of another one, unless it runs, and wait until it may drive."""
+        """Replace the robot by one with this body, unless it runs; wait until it may drive."""
         environment = self.environment(self.folder, body)
         running = self._robot is not None and self._body == body
         if not running:
@@ -76,7 +76,7 @@ class Home:
 def start(
     words: Words, folder: Path, environment: dict[str, str], out: int = subprocess.PIPE
 ) -> subprocess.Popen[bytes]:
-    """Start a line of a shell, or a program, in a process group of its own."""
+    """Start a shell line or a program in its own process group."""
     return subprocess.Popen(
         words,
         shell=isinstance(words, str),
@@ -93,18 +93,18 @@ def start(
 def start_behind(
     words: str, folder: Path, environment: dict[str, str], behind: contextlib.ExitStack
 ) -> None:
-    """Start something that runs until Ctrl-C at the end of `behind`."""
+    """Start a shell line that runs until Ctrl-C at the end of `behind`."""
     process = start(words, folder, environment, subprocess.DEVNULL)
     behind.callback(_end_of, process)
     behind.callback(os.killpg, process.pid, signal.SIGINT)
 
 
 def until_enabled(folder: Path, environment: dict[str, str], *, driven: bool = False) -> None:
-    """Wait until a robot may drive; enable it where a page has stopped one that was `driven`.
+    """Wait until a robot may drive; if it was `driven` before, enable it again.
 
     Raises TimeoutError.
     """
-    end_s = time.monotonic() + LINE_S
+    end_s = time.monotonic() + LINE_TIMEOUT_S
     while b"enabled" not in start(MODE, folder, environment).communicate()[0]:
         if time.monotonic() > end_s:
             raise TimeoutError("no robot drives")
@@ -114,12 +114,12 @@ def until_enabled(folder: Path, environment: dict[str, str], *, driven: bool = F
 
 
 def run(words: Words, folder: Path, environment: dict[str, str], after_s: float) -> str:
-    """Run something, to its end or until Ctrl-C; return what is wrong, or an empty text."""
+    """Run words to their end, or until Ctrl-C; return the fault, empty without one."""
     process = start(words, folder, environment)
     judges = isinstance(words, str) and words.startswith(JUDGES)
     good = {*range(INTERRUPTED)} - {USAGE} if judges else {0}
     try:
-        out, _ = process.communicate(timeout=after_s or LINE_S)
+        out, _ = process.communicate(timeout=after_s or LINE_TIMEOUT_S)
     except subprocess.TimeoutExpired:
         good = {0, INTERRUPTED} if after_s else set()
         os.killpg(process.pid, signal.SIGINT)
@@ -138,7 +138,7 @@ def _end_of(process: subprocess.Popen[bytes]) -> bytes:
 
 
 def as_installed(line: str) -> str:
-    """Return a line of `pip install` that installs into the page's own folder, or only asks."""
+    """Change a line of `pip install` to install into the page's folder, or to a dry run."""
     words = shlex.split(line, comments=True)
     if words[:2] != ["pip", "install"]:
         return line
@@ -150,7 +150,7 @@ def as_installed(line: str) -> str:
 
 
 def run_block(home: Home, folder: Path, block: Block, page: contextlib.ExitStack) -> str:
-    """Run a block; return what is wrong, or an empty text. At the end of `page` it ends."""
+    """Run a block, at most until the end of `page`; return the fault, empty without one."""
     body = next((known for word, known in BODIES.items() if word in block.value), "")
     if body:
         home.robot(body)
@@ -177,7 +177,7 @@ def run_block(home: Home, folder: Path, block: Block, page: contextlib.ExitStack
 
 
 def data_of(block: Block) -> Path | None:
-    """Return the folder of the data that a block needs, where it is there."""
+    """Return the folder of the data that a block needs; None if it is missing."""
     root = os.environ.get("GIGABRAIN_DATA")
     folder = Path(root or "", block.value.partition(",")[0])
     return folder if root and folder.is_dir() else None
@@ -186,7 +186,7 @@ def data_of(block: Block) -> Path | None:
 def judge(
     home: Home, page: Path, folder: Path, behind: contextlib.ExitStack
 ) -> Iterator[tuple[str, str]]:
-    """Run what is to be run of a page; yield the kind of each block and what is wrong with it."""
+    """Run the blocks of a page; yield the kind and the fault of each."""
     (folder / "deploy").symlink_to(ROOT / "deploy")
     found = list(blocks(page))
     for block in found:
@@ -217,7 +217,7 @@ def judge(
 
 
 def main() -> None:
-    """Run all pages, print the counts and what failed."""
+    """Run all pages; print the counts and the failures."""
     chosen = [ROOT / name for name in sys.argv[1:]] or pages()
     counts: Counter[str] = Counter()
     wrong = []

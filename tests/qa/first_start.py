@@ -1,8 +1,8 @@
-"""Times first starts, from nothing to a robot that navigates: `python -m tests.qa.first_start`.
+"""Times first starts, up to a robot that navigates: `python -m tests.qa.first_start`.
 
 Each begins in an empty folder with empty caches: it installs, runs `gigabrain demo` outside the
-checkout, and takes the times from its report. It fails where the robot does not move, makes no map
-or touches something. How long anything took is only printed.
+checkout, and reads the times from its report. It fails if the robot does not move, makes no map or
+touches something. Times are only printed.
 """
 
 import contextlib
@@ -27,10 +27,10 @@ from tests.places import ROOT
 Tool = Literal["pip", "uv"]
 Way = Literal["make", "wheel", "sdist", "tool"]
 EXTRAS = "[sim,nav,page]"
-OWN = ("VIRTUAL_ENV", "PYTHON", "GIGABRAIN", "XDG")  # variables that begin so are left out
+OWN = ("VIRTUAL_ENV", "PYTHON", "GIGABRAIN", "XDG")  # prefixes of variables that are left out
 CACHES = ("XDG_CACHE_HOME", "XDG_STATE_HOME", "XDG_RUNTIME_DIR", "PIP_CACHE_DIR", "UV_CACHE_DIR")
-FOR_A_PATH_S = 10.0  # that it explores until it is ended
-LONGEST_S = 240  # until it has a map, on a busy machine
+EXPLORE_S = 10.0  # duration of exploring, at most
+MAP_TIMEOUT_S = 240  # on a busy machine
 ENDED = (0, 2, -signal.SIGINT)  # exit codes after Ctrl-C: of the command, and two of make
 MINORS = range(11, 15)  # of Python 3
 Command = tuple[str | Path, ...]
@@ -87,17 +87,17 @@ def first_start(python: Path, tool: Tool, way: Way, built: Path) -> tuple[str, .
             return time.monotonic() - began_s
 
         def drive(*words: str | Path) -> None:
-            """Drive until it explores by its map, then end it as Ctrl-C does."""
+            """Drive until the robot explores by its map, then end it like Ctrl-C."""
             command = list(map(str, words))
             with subprocess.Popen(command, cwd=at, env=environment, start_new_session=True) as demo:
                 try:
-                    for _ in range(LONGEST_S):
+                    for _ in range(MAP_TIMEOUT_S):
                         with contextlib.suppress(subprocess.TimeoutExpired):
                             demo.wait(1.0)
                         if demo.returncode is not None or explores(folder):
                             break
                     with contextlib.suppress(subprocess.TimeoutExpired):
-                        demo.wait(FOR_A_PATH_S)
+                        demo.wait(EXPLORE_S)
                 finally:
                     if demo.returncode is None:
                         os.killpg(demo.pid, signal.SIGINT)
@@ -122,7 +122,7 @@ def first_start(python: Path, tool: Tool, way: Way, built: Path) -> tuple[str, .
 
 
 def explores(folder: Path) -> bool:
-    """Return whether a log in `folder` says that a robot drives by its own map."""
+    """Return whether a robot explores by its own map, by a log in `folder`."""
     logs = folder.glob("xdg_state_home/**/decision.jsonl")
     return any('"exploring: ' in log.read_text() for log in logs)
 
@@ -145,7 +145,7 @@ def commands(
 
 
 def empty_environment(folder: Path, tool: Tool) -> dict[str, str]:
-    """Return an environment with caches of its own, in which uv is found only if it is the tool."""
+    """Return an environment with its own caches; uv is only found if it is the tool."""
     kept = {name: value for name, value in os.environ.items() if not name.startswith(OWN)}
     tools = folder / "tools"
     tools.mkdir()
@@ -159,7 +159,7 @@ def empty_environment(folder: Path, tool: Tool) -> dict[str, str]:
 
 
 def place_of(name: str) -> str:
-    """Return where a program is, on PATH or beside this Python. Raises SystemExit."""
+    """Return the path of a program, on PATH or beside this Python. Raises SystemExit."""
     beside = str(Path(sys.executable).parent)
     return shutil.which(name) or shutil.which(name, path=beside) or sys.exit(f"no {name} here")
 
@@ -183,7 +183,7 @@ def version_of(python: Path) -> str:
 
 
 def contents(venv: Path) -> tuple[str, str]:
-    """Return the size of an environment [MB], and its packages but for those of a bare one."""
+    """Return the size of an environment [MB], and its number of packages without pip's."""
     size = sum(path.lstat().st_size for path in venv.rglob("*") if not path.is_dir())
     packages = {path.name.partition("-")[0] for path in venv.rglob("*.dist-info")}
     return f"{size / 1e6:.0f}", str(len(packages - {"pip", "setuptools"}))

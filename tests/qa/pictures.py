@@ -1,4 +1,4 @@
-"""Takes the screenshots of the operator page for the docs: python -m tests.qa.pictures FOLDER."""
+"""Takes the docs' screenshots of the operator page: `python -m tests.qa.pictures FOLDER`."""
 
 import asyncio
 import sys
@@ -23,11 +23,11 @@ from gigabrain_zenoh.ui.run_report import RunMonitor
 from tests.system.page import CHROMIUM, FLAGS, OPERATOR, Robot
 
 READY_S = 600.0  # a machine without compiled kernels compiles them first
-MAPPED_M2, MAP_S = 45.0, 300.0  # mapped area that a screenshot shows, and time until then
+MAPPED_M2, MAP_TIMEOUT_S = 45.0, 300.0  # least mapped area in a screenshot
 NAVIGATES: dict[str, Any] = {
     "perception": {"mapping": "slam"},
     "decision": {"behaviour": "navigate", "settings": {"start": "explore"}},
-    "speed": 2.0,  # in lock-step, so that a busy machine does not make it stop
+    "speed": 2.0,  # in lock-step, so that it does not stop on a busy machine
 }
 DRAWN_MS = 1200  # the tables are drawn once a second
 SIZES = {"light": (1280, 800), "phone": (390, 844), "dark": (1280, 800)}
@@ -73,7 +73,7 @@ PLACES = (Place(name="kitchen", x=2.0, y=-2.2), Place(name="bed", x=-2.3, y=1.0)
 
 
 class Scene(NamedTuple):
-    """A client that watches a robot, and the page in a browser."""
+    """A probe on a robot, and the page in a browser."""
 
     seen: Probe
     page: Page
@@ -81,7 +81,7 @@ class Scene(NamedTuple):
 
 @asynccontextmanager
 async def shown(world: str, text: str = "", **deployment: Any) -> AsyncIterator[Scene]:
-    """Start a robot in a world, or in one that a file with `text` describes, and open its page."""
+    """Start a robot in a world, or in one with the file content `text`, and open its page."""
     with tempfile.TemporaryDirectory() as place, closing(Home(Path(place) / "home")) as home:
         if text:
             file = home.folder / world
@@ -107,7 +107,7 @@ async def take_screenshots(folder: Path) -> None:
 
 
 async def take_arm_screenshot(folder: Path) -> None:
-    """Have an arm move blocks, and show it while it carries one."""
+    """Let an arm move blocks, and take a screenshot while it carries one."""
     decision = {"behaviour": "navigate", "settings": {"mission": mission_file("blocks", Path())}}
     async with shown("table", body="so101", decision=decision) as (seen, page):
         await until(lambda: carries(seen), "it carries a block", READY_S)
@@ -115,14 +115,14 @@ async def take_arm_screenshot(folder: Path) -> None:
 
 
 def carries(seen: Probe) -> bool:
-    """Return whether the gripper squeezes something while the arm turns."""
+    """Return whether the gripper holds something while the arm turns."""
     pan, *_, gripper = seen.state.joints
     squeezed = gripper.position - seen.state.joints_sent[-1] > 0.05
     return squeezed and abs(pan.velocity) > 0.3
 
 
 async def take_camera_screenshot(folder: Path) -> None:
-    """Explore a room with cameras until a thing is known, and show what they see."""
+    """Explore a room with cameras until an object is known, and take a screenshot."""
     async with shown("room.yaml", ROOM, cameras=True, **NAVIGATES) as (_, page):
         for part in ("#show-contours", "#tab-objects"):
             await page.wait_for_selector(part, timeout=READY_S * 1000)
@@ -132,7 +132,7 @@ async def take_camera_screenshot(folder: Path) -> None:
 
 
 async def take_world_screenshot(folder: Path) -> None:
-    """Put a box and a person into the house, and show it in 3-D."""
+    """Put a box and a person into the house, and take a screenshot in 3-D."""
     async with shown("house", seed=1) as (seen, page):
         for thing in THINGS:
             request = SimRequest(do="add", thing=thing)
@@ -153,7 +153,7 @@ async def take_map_screenshots(folder: Path) -> None:
         await until(lambda: watch.mapped_m2, "a map", READY_S)
         for name in SIZES:
             await prepare(page, name)
-            await until(lambda: is_worth_a_screenshot(watch), "a way in a map", MAP_S)
+            await until(lambda: is_worth_a_screenshot(watch), "a way in a map", MAP_TIMEOUT_S)
             await page.screenshot(path=folder / f"page_{name}.png")
         for zone in await zones_in_map(seen):
             (reply,) = await seen.bus.ask(ZONES_CHANGE, zone, timeout_s=READY_S)
@@ -167,7 +167,7 @@ async def take_map_screenshots(folder: Path) -> None:
 
 
 async def zones_in_map(seen: Probe) -> list[ZonesRequest]:
-    """Return requests for all zones and places, in the map, which began where the robot did."""
+    """Return requests for all zones and places, in the map; its origin is the robot's start."""
     (reply,) = await seen.bus.ask(SIM_CHANGE, SimRequest(), timeout_s=READY_S)
     assert reply.robot
     begin = compose(reply.robot, inverse(seen.state.pose))
@@ -190,7 +190,7 @@ def is_worth_a_screenshot(watch: RunMonitor) -> bool:
 
 
 async def prepare(page: Page, name: str) -> None:
-    """Set size and colours of the page; one page serves all, as several would slow the robot."""
+    """Set size and colours of the page; several pages would slow the robot down."""
     width, height = SIZES[name]
     await page.set_viewport_size({"width": width, "height": height})
     await page.emulate_media(color_scheme="dark" if name == "dark" else "light")

@@ -1,7 +1,7 @@
-"""Measure the sentences of README.md and docs/: `python -m tests.qa.sentences`.
+"""Measures the sentences of README.md and docs/: `python -m tests.qa.sentences`.
 
-Code, tables, headings, links' targets and comments are left out. An item of a list is a sentence
-by itself; a colon before a list or a block ends one. Prints each page's mean and the longest.
+Code, tables, headings, targets of links and comments are left out. A list item is a sentence; a
+colon before a list or a block ends one. It prints the mean of each page, and the longest sentences.
 """
 
 import re
@@ -19,7 +19,7 @@ CODE = re.compile(r"`[^`]*`")
 END = re.compile(r"(?<=[.!?])[)\"”*_]*\s+(?=[A-Z`(*\"“0-9])|(?<=:)\s*$")
 ABBREVIATIONS = re.compile(r"\b(e\.g|i\.e|etc|vs|al|No)\.")
 WORD = re.compile(r"[\w'./%°×-]*\w[\w'./%°×-]*")
-MEAN, PAGE_MEAN = 18.0, 20.0  # [words], of all sentences and of those of one page
+MEAN, PAGE_MEAN = 18.0, 20.0  # [words], limits for all sentences, and for those of a page
 
 
 def sentences(text: str) -> Iterator[str]:
@@ -31,12 +31,12 @@ def sentences(text: str) -> Iterator[str]:
 
 
 def words(sentence: str) -> int:
-    """Return how many words a sentence has; a piece of code is one."""
+    """Return the number of words in a sentence; a piece of code counts as one."""
     return len(WORD.findall(sentence))
 
 
 def _paragraphs(text: str) -> Iterator[str]:
-    """Yield paragraphs and items of lists, each in one line."""
+    """Yield paragraphs and list items, each as one line."""
     text = COMMENT.sub("", FENCE.sub("\n", text))
     text = CODE.sub("Code", LINK.sub(r"\1", ABBREVIATIONS.sub(r"\1", text)))
     lines: list[str] = []

@@ -1,7 +1,7 @@
-"""Command lines for the signal sweep, and the exit codes that each command may end with."""
+"""Command lines for the signal sweep, and the exit codes that each command may have."""
 
-# `{robot}`: the router of a robot that runs; `{router}`: a router without a robot; `{port}`: a free
-# port; `{file}`: a name for a new file; the rest are files of `tests.qa.signal_sweep.Stage`
+# `{robot}`: router of a running robot; `{router}`: router without a robot; `{port}`: free port;
+# `{file}`: name for a new file; the rest are files of `tests.qa.signal_sweep.Stage`
 CALLS = {
     "demo": "demo --behaviour avoid --headless",
     "up": "up {deployment}",
@@ -122,8 +122,8 @@ CALLS = {
     "completion": "completion bash",
 }
 
-# Ended by a signal in good order: 0, or the code that a command without a signal would end with.
-# These may also end with others by themselves, as the state of the robot has it.
+# After a signal, a command ends with 0, or with its code without a signal. These commands may also
+# end with other codes by themselves, depending on the robot's state.
 OWN_CODES = {
     "why": range(10, 20),
     **dict.fromkeys(
@@ -142,11 +142,11 @@ OWN_CODES = {
         (1,),
     ),
     **dict.fromkeys(("task cancel", "task pause", "task resume", "map save", "map info"), (1, 2)),
-    # without a map, a simulation, or what is named
+    # without a map, a simulation, or the named object
     **dict.fromkeys(("map load", "view", "world add", "world list", "world remove"), (1, 2)),
     **dict.fromkeys(("place add", "place list", "place remove", "zone add", "param save"), (1, 2)),
     **dict.fromkeys(("arm state", "arm jog", "arm home", "arm limp", "arm hold"), (1,)),  # no arm
     "ros2 topics": (1,),  # without another node
-    **dict.fromkeys(("objects", "pose"), (1,)),  # without cameras or a map, or not there
+    **dict.fromkeys(("objects", "pose"), (1,)),  # without cameras, a map, or the object
     **dict.fromkeys(("estop", "release", "enable", "topic pub", "doctor", "driver test"), (1, 3)),
 }

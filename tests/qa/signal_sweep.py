@@ -26,9 +26,9 @@ from gigabrain_zenoh.testing.processes import GIGABRAIN, Home, free_port
 from tests.places import ROOT
 from tests.qa.signal_commands import CALLS, OWN_CODES
 
-LIMIT_S = 2.0  # from the signal to the end, less the time without a processor
+LIMIT_S = 2.0  # from the signal to the end, without the time without a processor
 PATIENCE_S = 20.0
-LONGEST_S = 5.0  # of a life that is looked at
+MAX_LIFE_S = 5.0  # of a command, for the moments of signals
 MARK = "GIGABRAIN_SIGNAL_SWEEP"
 NOISE = ("Traceback", "Exception ignored", "Error in", "never awaited", "Fatal")
 
@@ -42,14 +42,14 @@ class Trial(Struct, frozen=True, kw_only=True):
     at_s: float
     code: int
     took_s: float  # from the signal to the end
-    waited_s: float  # of that, without a processor
+    waited_s: float  # part of it without a processor
     problem: str = ""
 
 
 class Stage:
-    """The surroundings of the commands: a robot, a bare router, files, and folders of their own.
+    """The environment of the commands: a robot, a bare router, files and folders.
 
-    Without `robot` there is only a router, which tools take for a robot.
+    Without `robot` there is only a router, which tools use like a robot.
     """
 
     def __init__(self, folder: Path, *, robot: bool = True) -> None:
@@ -79,7 +79,7 @@ class Stage:
             raise RuntimeError(done.stderr.decode())
 
     def words(self, command: str) -> list[str]:
-        """Return the words of its command line, with a new name and a free port."""
+        """Return the words of a command line, with a new name and a free port."""
         name = f"new_{next(self._names)}"
         places = {
             "robot": self.robot,
@@ -96,13 +96,13 @@ class Stage:
         return CALLS[command].format(**places).split()
 
     def temporary(self, mark: str) -> Path:
-        """The folder for the temporary files of a marked command."""
+        """Return the folder for the temporary files of a marked command."""
         folder = self.folder / f"tmp-{mark}"
         folder.mkdir(exist_ok=True)
         return folder
 
     def start(self, command: str, mark: str) -> subprocess.Popen[bytes]:
-        """Start a command, marked together with all that it starts."""
+        """Start a command; it and its children have the mark in their environment."""
         terminal = command in ("teleop", "top")
         return subprocess.Popen(
             (*GIGABRAIN, *self.words(command)),
@@ -115,7 +115,7 @@ class Stage:
         )
 
     def close(self) -> None:
-        """End what was started."""
+        """End all processes."""
         self.home.close()
         self._elsewhere.close()
 
@@ -130,7 +130,7 @@ def handled(pid: int, number: int) -> bool:
 
 
 def without_processor_s(pid: int) -> float:
-    """Return the time that a process's threads have waited for a processor [s] (schedstat)."""
+    """Return the time that a process's threads waited for a processor [s] (schedstat)."""
     waited_ns = 0
     for path in Path(f"/proc/{pid}/task").glob("*/schedstat"):
         with contextlib.suppress(OSError):
@@ -139,7 +139,7 @@ def without_processor_s(pid: int) -> float:
 
 
 def left_behind(mark: str) -> list[int]:
-    """The processes with this mark in their environment."""
+    """Return the pids of processes with this mark in their environment."""
     pids = []
     for path in Path("/proc").glob("[0-9]*/environ"):
         with contextlib.suppress(OSError):
@@ -149,19 +149,19 @@ def left_behind(mark: str) -> list[int]:
 
 
 def life_s(stage: Stage, command: str) -> tuple[float, int | None]:
-    """Run a command without a signal. Return the time it ran [s], and its exit code.
+    """Run a command without a signal; return its duration [s] and its exit code.
 
-    A command that runs for LONGEST_S is killed; its exit code is None.
+    A command that runs for MAX_LIFE_S is killed; its exit code is None.
     """
     began_s, mark = time.monotonic(), uuid.uuid4().hex
     process = stage.start(command, mark)
     try:
-        _, errors = process.communicate(timeout=LONGEST_S)
+        _, errors = process.communicate(timeout=MAX_LIFE_S)
         if b"Usage" in errors or process.returncode == 2:
             raise RuntimeError(f"{command}: {errors.decode()}")
         return time.monotonic() - began_s, process.returncode
     except subprocess.TimeoutExpired:
-        return LONGEST_S, None
+        return MAX_LIFE_S, None
     finally:
         _kill(process, mark)
 
@@ -180,15 +180,15 @@ def attempt(
     mark, wanted = uuid.uuid4().hex, signal.Signals[name]
     process = stage.start(command, mark)
     time.sleep(at_s)
-    ready = handled(process.pid, signal.SIGTERM)  # of SIGINT Python itself has a handler
+    ready = handled(process.pid, signal.SIGTERM)  # Python always handles SIGINT
     before_s = waited_s = without_processor_s(process.pid)
     sent_s = time.monotonic()
-    os.kill(process.pid, wanted)  # also where it has just ended: it is not reaped yet
+    os.kill(process.pid, wanted)  # works also if it has ended, as it is not reaped yet
     while not _over(process.pid) and time.monotonic() < sent_s + PATIENCE_S:
         waited_s = max(waited_s, without_processor_s(process.pid))
         time.sleep(0.005)
     took_s = time.monotonic() - sent_s
-    time.sleep(0.05)  # the kernel ends what dies with its parent
+    time.sleep(0.05)  # for children that die with their parent
     left = [_name(pid) for pid in left_behind(mark) if pid != process.pid]
     left += [path.name for path in stage.temporary(mark).iterdir()]
     _kill(process, mark)
@@ -224,7 +224,7 @@ def _problem(trial: Trial, ready: bool, errors: str, left: Sequence[str], own: s
         return f"did not end in time, {'ready' if ready else 'not ready'}: {errors[-800:]}"
     if left:
         return f"left behind: {left}"
-    # before its first line a command is Python's: the signal kills, or breaks off Python's start
+    # before a command's first line, the signal kills Python or interrupts its start
     codes = own | {128 + wanted} | (set() if ready else {-wanted, 1})
     if trial.code not in codes:
         return f"exit code {trial.code}, expected one of {sorted(codes)}: {errors[-800:]}"
@@ -234,7 +234,7 @@ def _problem(trial: Trial, ready: bool, errors: str, left: Sequence[str], own: s
 
 
 def sweep(commands: Sequence[str], moments: range, seed: int, results: Path) -> Counter[str]:
-    """Try all that is not in `results` yet; the problems, counted by command."""
+    """Run the trials that are not in `results` yet; return the number of problems by command."""
     done = {(t.command, t.number, t.signal) for t in read(results)}
     with TemporaryDirectory(prefix="signals-") as folder, results.open("ab", buffering=0) as out:
         stage = Stage(Path(folder))
@@ -258,13 +258,13 @@ def sweep(commands: Sequence[str], moments: range, seed: int, results: Path) -> 
 
 
 def read(results: Path) -> list[Trial]:
-    """Return the trials of earlier calls; none where the file is missing."""
+    """Return the trials of earlier calls; none if the file is missing."""
     lines = results.read_bytes().splitlines() if results.exists() else []
     return [msgspec.json.decode(line, type=Trial) for line in lines]
 
 
 def main() -> int:
-    """Entry of the program; the exit code."""
+    """Run the program; return the exit code."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--moments", type=int, default=100, help="for each command and signal")
     parser.add_argument("--first", type=int, default=0, help="number of the first moment")

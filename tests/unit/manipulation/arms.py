@@ -1,4 +1,4 @@
-"""The SO-101 as the tests of manipulation know it."""
+"""The SO-101 for the tests of manipulation."""
 
 import functools
 
@@ -38,5 +38,5 @@ def inverse() -> InverseKinematics:
 
 
 def postures(count: int, seed: int = 0) -> Floats:
-    """Random postures (count, 5) within the limits."""
+    """Return random postures (count, 5) within the limits."""
     return np.random.default_rng(seed).uniform(arm().lower, arm().upper, (count, 5))

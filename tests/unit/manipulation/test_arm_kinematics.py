@@ -1,4 +1,4 @@
-"""Kinematics from a model, against MuJoCo's own, and models that are refused."""
+"""Kinematics compared with MuJoCo's, and refused models."""
 
 import mujoco
 import numpy as np
@@ -12,12 +12,12 @@ from tests.unit.manipulation.arms import JOINTS, MODEL, arm, postures
 TEXT = MODEL.read_text()
 
 
-def test_the_arm_weighs_what_the_real_one_does() -> None:
+def test_the_arm_has_the_mass_of_the_real_one() -> None:
     model = mujoco.MjModel.from_xml_path(str(MODEL))
     assert model.body_mass.sum() == pytest.approx(0.632, abs=0.001)
 
 
-def test_the_tool_is_where_mujoco_says() -> None:
+def test_the_pose_of_the_tool_is_that_of_mujoco() -> None:
     model = mujoco.MjModel.from_xml_path(str(MODEL))
     data = mujoco.MjData(model)
     frame, joints = np.empty((3, 4)), np.empty((5, 2, 3))
@@ -47,7 +47,7 @@ def test_the_jacobian_is_the_slope_of_the_pose() -> None:
             assert np.allclose(about, jacobian[3:, joint], atol=1e-5)
 
 
-def test_the_gripper_opens_as_its_joint_turns() -> None:
+def test_the_gripper_opens_when_its_joint_turns() -> None:
     opening = arm().opening()
     assert opening.widest > 0.08
     for width in (0.01, 0.02, 0.04):
@@ -56,14 +56,14 @@ def test_the_gripper_opens_as_its_joint_turns() -> None:
     assert opening.position(0.02) < opening.position(0.04)
 
 
-def test_a_base_that_drives_is_where_all_poses_begin() -> None:
+def test_poses_are_in_the_frame_of_a_driving_base() -> None:
     driving = TEXT.replace('<body name="base">', '<body name="base" pos="1 2 3"><freejoint/>')
-    there = ArmKinematics(driving, JOINTS).forward(np.zeros(5))
-    assert np.allclose(there.position, arm().forward(np.zeros(5)).position)
+    frame = ArmKinematics(driving, JOINTS).forward(np.zeros(5))
+    assert np.allclose(frame.position, arm().forward(np.zeros(5)).position)
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "message"),
     [
         (" " * 262_145, "262145 characters"),
         ('<mujoco><include file="a.xml"/></mujoco>', "'<include'"),
@@ -77,8 +77,8 @@ def test_a_base_that_drives_is_where_all_poses_begin() -> None:
         (TEXT.replace('"elbow_flex"', '"elbow"'), "elbow_flex"),
     ],
 )
-def test_a_model_that_cannot_be_used_is_refused_in_one_line(text: str, said: str) -> None:
+def test_an_unusable_model_is_refused_in_one_line(text: str, message: str) -> None:
     with pytest.raises(ConfigError) as error:
         ArmKinematics(text, JOINTS)
-    assert said in str(error.value)
+    assert message in str(error.value)
     assert "\n" not in str(error.value)

@@ -1,4 +1,4 @@
-"""Postures for the tool: reachable ones are found, others are explained."""
+"""Reachable goals of the tool are found; others are explained."""
 
 import math
 
@@ -13,24 +13,24 @@ from tests.unit.manipulation.arms import arm, inverse, postures
 DOWN = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])
 
 
-def test_every_pose_that_the_arm_has_is_found() -> None:
+def test_every_possible_pose_is_found() -> None:
     for posture, start in zip(postures(200), postures(200, seed=1), strict=True):
         frame = arm().forward(posture)
         found = inverse().solve(ToolGoal(position=frame.position, axes=frame.axes), start)
         assert isinstance(found, Reachable), found
         assert arm().inside(found.posture)
-        there = arm().forward(found.posture)
-        assert np.linalg.norm(there.position - frame.position) < 1e-4
-        assert math.acos(min(1.0, (np.trace(there.axes.T @ frame.axes) - 1) / 2)) < 0.011
+        reached = arm().forward(found.posture)
+        assert np.linalg.norm(reached.position - frame.position) < 1e-4
+        assert math.acos(min(1.0, (np.trace(reached.axes.T @ frame.axes) - 1) / 2)) < 0.011
 
 
-def test_nearly_every_direction_that_the_arm_has_is_found() -> None:
+def test_nearly_every_possible_direction_is_found() -> None:
     found = 0
     for posture in postures(200):
         frame = arm().forward(posture)
         goal = ToolGoal(position=frame.position, approach=frame.axes[:, 0])
         found += isinstance(inverse().solve(goal), Reachable)
-    assert found >= 190  # the rest end in valleys
+    assert found >= 190  # the rest end in local minima
 
 
 @pytest.mark.parametrize("radius", [0.08, 0.14, 0.20, 0.26])
@@ -42,7 +42,7 @@ def test_the_tool_can_point_down_over_the_table(radius: float, azimuth: float) -
     assert isinstance(found, Reachable)
 
 
-def test_the_answer_is_the_same_each_time() -> None:
+def test_solving_is_deterministic() -> None:
     goal = ToolGoal(position=np.array([0.2, 0.1, 0.05]), axes=DOWN)
     first, second = inverse().solve(goal), inverse().solve(goal)
     assert isinstance(first, Reachable)
@@ -50,7 +50,7 @@ def test_the_answer_is_the_same_each_time() -> None:
     assert np.array_equal(first.posture, second.posture)
 
 
-def test_a_start_near_the_goal_is_kept() -> None:
+def test_the_posture_is_near_a_start_that_is_near_the_goal() -> None:
     for posture in postures(50):
         near = np.clip(posture + 0.02, arm().lower, arm().upper)
         frame = arm().forward(posture)
@@ -59,12 +59,12 @@ def test_a_start_near_the_goal_is_kept() -> None:
         assert np.abs(found.posture - posture).max() < 0.1
 
 
-def test_a_goal_that_is_too_far_says_by_how_much() -> None:
+def test_the_reason_for_a_far_goal_names_the_distance() -> None:
     found = inverse().solve(ToolGoal(position=np.array([1.0388, 0.0, 0.1166])))
     assert isinstance(found, OutOfReach)
     assert found.posture is not None
-    left = 1.0388 - np.linalg.norm(arm().forward(found.posture).position * [1, 0, 0])
-    assert found.position_error == pytest.approx(left, abs=0.01)
+    missing = 1.0388 - np.linalg.norm(arm().forward(found.posture).position * [1, 0, 0])
+    assert found.position_error == pytest.approx(missing, abs=0.01)
     assert f"too far by {found.position_error * 100:.1f} cm" in found.reason
 
 
@@ -75,7 +75,7 @@ def test_a_goal_behind_the_arm_names_the_joint_at_its_limit() -> None:
     assert "is at its limit of" in found.reason
 
 
-def test_an_orientation_that_is_not_possible_says_by_how_much_and_keeps_the_place() -> None:
+def test_the_reason_for_an_impossible_orientation_names_the_angle() -> None:
     goal = ToolGoal(position=np.array([0.25, 0.0, 0.1]), approach=np.array([0.0, 1.0, 0.0]))
     found = inverse().solve(goal)
     assert isinstance(found, OutOfReach)
@@ -87,7 +87,7 @@ def test_an_orientation_that_is_not_possible_says_by_how_much_and_keeps_the_plac
     assert f"off by {math.degrees(off):.0f}°" in found.reason
 
 
-def test_where_the_orientation_is_not_possible_the_place_is_reached() -> None:
+def test_with_an_impossible_orientation_the_position_is_reached() -> None:
     random = np.random.default_rng(2)
     for posture in postures(100):
         approach = random.normal(size=3)
@@ -100,7 +100,7 @@ def test_where_the_orientation_is_not_possible_the_place_is_reached() -> None:
 
 
 @pytest.mark.parametrize("tolerance", [0.2, math.pi])
-def test_a_goal_is_reached_with_any_turn_that_it_allows(tolerance: float) -> None:
+def test_a_goal_is_reached_within_its_orientation_tolerance(tolerance: float) -> None:
     random, turned, found = np.random.default_rng(3), 0, 0
     for posture in postures(60):
         frame = arm().forward(posture)
@@ -116,10 +116,10 @@ def test_a_goal_is_reached_with_any_turn_that_it_allows(tolerance: float) -> Non
         found += isinstance(one, Reachable)
         turned += isinstance(one, Reachable) and one.orientation_error > 0.05
     assert found == 60
-    assert turned > 10  # most are not possible as they were asked for
+    assert turned > 10  # most are impossible without the tolerance
 
 
-def test_a_posture_that_collides_is_not_taken() -> None:
+def test_a_posture_that_collides_is_not_returned() -> None:
     goal = ToolGoal(position=np.array([0.2, 0.0, 0.1]))
     found = inverse().solve(goal, collides=lambda posture: "palm and shelf")
     assert isinstance(found, OutOfReach)
@@ -136,14 +136,14 @@ def test_a_posture_that_collides_is_not_taken() -> None:
         ToolGoal(position=np.zeros(3), approach=np.array([2.0, 0.0, 0.0])),
     ],
 )
-def test_what_is_no_goal_is_refused(goal: ToolGoal) -> None:
+def test_an_invalid_goal_is_refused(goal: ToolGoal) -> None:
     found = inverse().solve(goal)
     assert isinstance(found, OutOfReach)
     assert (found.cause, found.posture) == ("invalid", None)
 
 
 @given(st.tuples(*(st.floats(-1.0, 1.0) for _ in range(3))))
-def test_no_answer_is_outside_the_limits_or_lies_about_its_place(
+def test_every_result_is_within_the_limits_and_has_the_true_error(
     place: tuple[float, float, float],
 ) -> None:
     goal = ToolGoal(position=np.array(place))

@@ -1,4 +1,4 @@
-"""How phases are carried out, tick by tick."""
+"""Execution of phases, tick by tick."""
 
 import numpy as np
 
@@ -15,7 +15,7 @@ def moved() -> Phase:
     return Phase(name="move", arm=TimeParametrization(arm().joints).trajectory(postures))
 
 
-def test_once_all_is_over_the_arm_stays_at_the_end_of_its_trajectory() -> None:
+def test_after_the_last_phase_the_arm_stays_at_the_end_of_its_trajectory() -> None:
     run = PhaseRun((moved(),), "gripper", 100)
     tick = 100
     while run.phase:
@@ -29,7 +29,7 @@ def test_once_all_is_over_the_arm_stays_at_the_end_of_its_trajectory() -> None:
         assert np.allclose(window.array(), END)
 
 
-def test_once_all_is_over_a_gripper_stays_where_it_was_sent() -> None:
+def test_after_the_last_phase_a_gripper_stays_at_its_goal() -> None:
     run = PhaseRun((moved(), Phase(name="grip", gripper=0.7)), "gripper", 0)
     for tick in range(1000):
         run.advance(tick)

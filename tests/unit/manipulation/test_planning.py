@@ -1,4 +1,4 @@
-"""Paths and trajectories that touch nothing, and grasps; judged by models built apart."""
+"""Collision-free paths and trajectories, and grasps; separate models judge them."""
 
 import math
 
@@ -30,7 +30,7 @@ BOX = '<geom name="cube" type="box" size=".015 .015 .015" pos=".0981274 -.000218
 
 
 class Judge:
-    """Contacts in a world that is written by hand, by MuJoCo."""
+    """Finds contacts in a handwritten MuJoCo world."""
 
     def __init__(self, *, held: bool = False) -> None:
         text = MODEL.read_text().replace('<body name="base">', WORLD)
@@ -48,7 +48,7 @@ class Judge:
         ]
 
 
-def test_what_the_checker_lets_pass_touches_nothing() -> None:
+def test_a_free_posture_has_no_contacts_in_mujoco() -> None:
     checker, judge = CollisionChecker(arm(), [FLOOR, SHELF], margin=0.0), Judge()
     free = 0
     for posture in postures(1000):
@@ -57,14 +57,14 @@ def test_what_the_checker_lets_pass_touches_nothing() -> None:
     assert 200 < free < 800
 
 
-def test_the_clearance_is_the_distance_to_what_is_named() -> None:
+def test_the_clearance_is_the_distance_to_the_named_thing() -> None:
     ball = Thing(name="ball", kind="sphere", size=(0.02,), position=np.array([0.45, 0.0, 0.2205]))
     found = CollisionChecker(arm(), [ball]).clearance(np.zeros(5))
     assert set(found.pair or ()) == {"pad_fixed", "ball"}
     assert found.distance == pytest.approx(0.45 - 0.02 - 0.2932354 - 0.1045, abs=0.001)
 
 
-def test_a_held_thing_counts_and_may_be_let_touch() -> None:
+def test_a_held_thing_collides_unless_it_is_ignored() -> None:
     low = Thing(name="table", kind="box", size=(1, 1, 0.1), position=np.array([0.6, 0, 0.13]))
     posture = np.zeros(5)
     hand = CollisionChecker(arm(), [low], margin=0.0)
@@ -92,7 +92,7 @@ def test_wrong_things_are_refused(make: object) -> None:
 
 
 def below_and_above(checker: CollisionChecker, count: int) -> list[tuple[Floats, Floats]]:
-    """Postures below the shelf and above it, that touch nothing."""
+    """Return pairs of free postures, below the shelf and above it."""
     random, found = np.random.default_rng(3), []
 
     def reach(low: float, high: float) -> Floats:
@@ -147,7 +147,7 @@ def test_a_plan_is_the_same_for_the_same_seed() -> None:
     assert np.array_equal(first.postures, second.postures)
 
 
-def test_a_plan_that_cannot_be_says_why() -> None:
+def test_an_impossible_plan_has_a_cause() -> None:
     checker = CollisionChecker(arm(), [FLOOR, SHELF])
     ((below, above),) = below_and_above(checker, 1)
     into = np.array([0.0, 1.2, 0.5, 0.0, 0.0])
@@ -164,7 +164,7 @@ def test_a_plan_that_cannot_be_says_why() -> None:
 
 
 def near_the_shelf(checker: CollisionChecker, posture: Floats, gap: float) -> Floats:
-    """Return where the shoulder has lifted an arm from below the shelf up to a gap [m] from it."""
+    """Return a posture, lifted by the shoulder from below the shelf up to a gap [m]."""
     low, high = posture, posture.copy()
     while checker.clearance(high).distance > gap:
         high = high - np.array([0.0, 0.02, 0.0, 0.0, 0.0])
@@ -177,7 +177,7 @@ def near_the_shelf(checker: CollisionChecker, posture: Floats, gap: float) -> Fl
 
 @pytest.mark.long
 @pytest.mark.parametrize("gap", [0.0012, -0.003, -0.008])
-def test_a_start_that_is_a_bit_too_near_is_left_without_coming_nearer(gap: float) -> None:
+def test_a_start_that_is_slightly_too_near_is_left_without_coming_nearer(gap: float) -> None:
     checker = CollisionChecker(arm(), [FLOOR, SHELF], margin=0.002)
     pairs = [(near_the_shelf(checker, a, gap), b) for a, b in below_and_above(checker, 5)]
     inside = [(start, above) for start, above in pairs if arm().inside(start)]
@@ -202,15 +202,15 @@ def test_a_start_in_motion_goes_on_smoothly() -> None:
     assert_within_limits(moving)
 
 
-def test_what_ruckig_cannot_solve_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_limits_that_ruckig_refuses_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     timing = TimeParametrization(arm().joints)
     monkeypatch.setattr(timing, "joints", tuple(replace(j, max_jerk=-1.0) for j in timing.joints))
     with pytest.raises(Refused, match=r"no trajectory within the limits of the joints: .*jerk"):
         timing.trajectory(np.stack((np.zeros(5), np.full(5, 0.5))))
 
 
-@pytest.mark.parametrize("speed", [0.91, 1.5, 1.57])  # of shares of 2.6, 3 and 3.14
-def test_a_joint_may_pass_corners_at_its_greatest_speed(speed: float) -> None:
+@pytest.mark.parametrize("speed", [0.91, 1.5, 1.57])  # shares of 2.6, 3 and 3.14
+def test_a_joint_may_pass_corners_at_its_top_speed(speed: float) -> None:
     timing = TimeParametrization([replace(one, max_speed=speed) for one in arm().joints])
     moves = np.random.default_rng(0).uniform(0.0, 0.3, (200, 2, 5))
     moves[:, :, 0] += 0.3  # the first joint is the slowest all the way
@@ -220,7 +220,7 @@ def test_a_joint_may_pass_corners_at_its_greatest_speed(speed: float) -> None:
         assert np.abs(found.velocities).max() < speed + 1e-9
 
 
-def test_no_move_takes_no_time() -> None:
+def test_a_move_of_zero_length_takes_no_time() -> None:
     still = TimeParametrization(arm().joints).trajectory(np.zeros((2, 5)))
     assert still.duration == 0.0
     assert np.array_equal(still.positions, np.zeros((1, 5)))
@@ -241,7 +241,7 @@ def test_things_on_the_table_can_be_grasped(kind: str, size: tuple[float, ...]) 
         assert_held(grasp, thing)
 
 
-def test_a_wide_thing_is_grasped_from_above_where_there_is_room() -> None:
+def test_a_wide_thing_is_grasped_from_above_if_the_clearance_suffices() -> None:
     planner = GraspPlanner(arm(), inverse())
     can = Thing(
         name="can", kind="cylinder", size=(0.034, 0.11), position=np.array([0.22, 0.05, 0.055])
@@ -254,7 +254,7 @@ def test_a_wide_thing_is_grasped_from_above_where_there_is_room() -> None:
 
 
 def assert_held(grasp: Grasp, thing: Thing) -> None:
-    """Assert that the thing is between the fingers, which touch nothing until they close."""
+    """Assert that the thing is between the fingers, and the open hand touches nothing."""
     tool = arm().forward(grasp.posture)
     middle = tool.axes.T @ (thing.position - tool.position)
     opening = arm().opening()
@@ -268,14 +268,14 @@ def assert_held(grasp: Grasp, thing: Thing) -> None:
 
 
 @pytest.mark.long
-def test_what_cannot_be_grasped_says_why() -> None:
+def test_an_impossible_grasp_has_a_reason() -> None:
     planner = GraspPlanner(arm(), inverse())
     wide = Thing(name="crate", kind="box", size=(0.2,) * 3, position=np.array([0.25, 0, 0.1]))
     far = Thing(name="ball", kind="sphere", size=(0.02,), position=np.array([1.0, 0, 0.02]))
-    for thing, said in ((wide, "crate is 20.0 cm wide"), (far, "too far by")):
+    for thing, reason in ((wide, "crate is 20.0 cm wide"), (far, "too far by")):
         found = planner.grasps(thing, [FLOOR])
         assert isinstance(found, NoGrasp)
-        assert said in found.reason
+        assert reason in found.reason
 
 
 def test_joints_of_another_arm_are_refused() -> None:
@@ -283,7 +283,7 @@ def test_joints_of_another_arm_are_refused() -> None:
         type(arm())(MODEL.read_text(), JOINTS[5:])
 
 
-def test_ways_keep_off_boxes_by_more_than_safety_does() -> None:
+def test_the_clearance_from_boxes_is_larger_than_safetys() -> None:
     body = load_robot("so101").description()
     assert body.arm
     shelf = KeepOut(name="shelf", center=(0.3, 0.0, 0.2), size=(0.2, 0.4, 0.02))
@@ -292,7 +292,7 @@ def test_ways_keep_off_boxes_by_more_than_safety_does() -> None:
         assert side / 2 > given / 2 + body.thresholds.arm_clearance + 0.002
 
 
-def test_ways_keep_off_the_floor_by_more_than_safety_does_where_they_can() -> None:
+def test_the_clearance_from_the_floor_is_larger_than_safetys_if_possible() -> None:
     body = load_robot("so101").description()
     planner, random = ArmPlanner(MODEL.read_text(), body), np.random.default_rng(0)
     floor = CollisionChecker(planner.arm, [Thing(name="floor", kind="floor")], margin=0.0)

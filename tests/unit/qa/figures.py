@@ -1,4 +1,4 @@
-"""Figures of the benches, as if they had been measured."""
+"""Made-up figures of benchmarks."""
 
 from gigabrain_zenoh.qa.bench.chain import RateComparison
 from gigabrain_zenoh.qa.judging import Latencies

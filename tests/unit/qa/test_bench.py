@@ -1,4 +1,4 @@
-"""The benches: what they make of figures, what they show, and the commands on a robot."""
+"""Benchmarks: figures, limits and printed pages."""
 
 import io
 
@@ -44,7 +44,7 @@ def shown(page: RenderableType) -> str:
     return capture.get()
 
 
-def test_a_table_that_is_too_wide_for_a_terminal_breaks_heads_and_cuts_nothing() -> None:
+def test_a_wide_table_breaks_headers_and_cuts_nothing() -> None:
     table = table_of("joint", "swing", "off rms", "off at most", "late", "overshoot", "off at rest")
     table.add_row("shoulder_pan", "±27°", "0.54°", "0.90°", "-1 ms", "0.2%", "0.12°")
     console = Console(width=80, no_color=True)
@@ -53,34 +53,34 @@ def test_a_table_that_is_too_wide_for_a_terminal_breaks_heads_and_cuts_nothing()
     assert "…" not in capture.get()
 
 
-def test_what_the_whole_robot_costs_leaves_its_physics_out() -> None:
+def test_the_cost_of_a_robot_excludes_its_physics() -> None:
     assert stack().cpu_without_physics == pytest.approx(0.1725)
     assert stack(physics_cpu=None).cpu_without_physics == pytest.approx(0.2125)
     assert physics_share({"physics_cpu_s": 1.5}, {"physics_cpu_s": 2.5}, 20.0) == 0.05
     assert physics_share({}, {"physics_cpu_s": 2.5}, 20.0) is None
 
 
-def test_the_emulator_of_an_arm_does_not_count_and_its_limit_is_another() -> None:
+def test_the_emulator_of_an_arm_does_not_count_and_the_limit_is_higher() -> None:
     emulator = ProcessCost(name="emulator", cpu=0.25, rss_bytes=95_000_000)
     arm = stack(link="emulated", physics_cpu=None, arm_hz=100.0, processes=(
         emulator, ProcessCost(name="safety", cpu=0.36, rss_bytes=90_000_000),
     ))  # fmt: skip
-    held = {
+    judged = {
         limit.figure.name: (value, limit.allows(value)) for limit, value in targets(arm).items()
     }
-    assert held == {
+    assert judged == {
         "all ready after": (1.2, True),
         "CPU without physics": (pytest.approx(36.0), False),
     }
     assert "100 commands a second to its arm" in shown(stack_page(arm))
 
 
-def test_targets_are_held_against_the_figures() -> None:
-    reached = [
+def test_figures_are_compared_with_their_limits() -> None:
+    judged = [
         (limit.figure.name, round(value, 2), limit.at_most, limit.allows(value))
         for limit, value in targets(stack()).items()
     ]
-    assert reached == [
+    assert judged == [
         ("all ready after", 1.2, 1.5, True),
         ("CPU without physics", 17.25, 30.0, True),
         ("physics and lidar", 4.0, 5.0, True),
@@ -95,9 +95,9 @@ def test_targets_are_held_against_the_figures() -> None:
         drives_s=4.0,
         drives_cpu_s=5.1,
     )
-    held = {limit.figure.name: limit for limit in targets(stack(first_goal=goal))}
-    assert held["first goal accepted after"].allows(1.9)
-    assert not held["first goal accepted after"].allows(2.1)
+    limits = {limit.figure.name: limit for limit in targets(stack(first_goal=goal))}
+    assert limits["first goal accepted after"].allows(1.9)
+    assert not limits["first goal accepted after"].allows(2.1)
     without_mujoco = targets(stack(physics_cpu=None))
     assert [limit.figure.name for limit in without_mujoco][1:] == [
         "CPU without physics",
@@ -107,7 +107,7 @@ def test_targets_are_held_against_the_figures() -> None:
     assert not memory.allows(value)
 
 
-def test_the_pages_say_it_all() -> None:
+def test_the_pages_show_all_figures() -> None:
     hop = Hop(name="scan → world", took=1.0, put=0.1, bridge=0.05, decode=0.02, step=0.23)
     result = ChainResult(
         seconds=10.0,

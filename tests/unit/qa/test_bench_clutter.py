@@ -1,4 +1,4 @@
-"""The benchmark of cluttered worlds: its worlds, its results, and what it prints."""
+"""The benchmark of cluttered worlds: its worlds, its results, and its table."""
 
 import itertools
 import math
@@ -54,17 +54,17 @@ def test_worlds_repeat_and_differ_by_seed() -> None:
 
 @pytest.mark.parametrize("world", WORLDS)
 def test_the_body_fits_at_all_goals_and_at_the_start(world: ClutteredWorld) -> None:
-    bars = [one.outline for one in world.parts if one.bottom < BODY.body_height]
-    bars += [one.outline for one in world.pits]
+    obstacles = [one.outline for one in world.parts if one.bottom < BODY.body_height]
+    obstacles += [one.outline for one in world.pits]
     corner = max(math.hypot(x, y) for x, y in BODY.footprint)
     places = np.array([(world.start.x, world.start.y), *world.goals])
     assert len(places) == GOALS + 1
-    assert (distances(bars, places) > corner + 0.1).all()
+    assert (distances(obstacles, places) > corner + 0.1).all()
     assert (np.abs(places) < HALF_M - corner).all()
 
 
 @pytest.mark.parametrize("world", WORLDS)
-def test_most_of_what_stands_there_is_not_in_the_plane_of_the_lidar(world: ClutteredWorld) -> None:
+def test_many_things_are_not_in_the_plane_of_the_lidar(world: ClutteredWorld) -> None:
     unseen = {
         one.thing for one in world.parts
         if one.bottom < BODY.body_height and not one.bottom < LIDAR_PLANE_M < one.top
@@ -79,7 +79,7 @@ def test_all_kinds_are_drawn() -> None:
     assert {kind for world in worlds for kind in world.kinds} == set(KINDS)
 
 
-def test_a_way_leads_round_what_bars_it_and_not_through_a_narrow_gap() -> None:
+def test_a_way_leads_round_obstacles_and_not_through_a_narrow_gap() -> None:
     wall = Part(0, 0.0, -0.4, 0.05, HALF_M - 0.4, 0.05)  # 0.8 m of room at its northern end
     shelf = Part(1, 0.0, HALF_M - 0.4, 0.05, 0.4, 0.2, bottom=0.1)
     roof = Part(1, 0.0, HALF_M - 0.4, 0.05, 0.4, 0.6, bottom=0.5)
@@ -95,7 +95,7 @@ def test_a_way_leads_round_what_bars_it_and_not_through_a_narrow_gap() -> None:
     assert way((wall,), (narrowing,)) == math.inf
 
 
-def test_the_floor_has_holes_where_the_pits_are_and_nowhere_else() -> None:
+def test_the_floor_has_holes_only_at_the_pits() -> None:
     pits = (Pit(0.2, 0.3, 0.3, 0.2, 0.25), Pit(-0.9, 0.35, 0.2, 0.4, 0.1))
     world = ClutteredWorld(0, (), (), pits, Pose(x=0.0, y=-1.0, yaw=0.0), (), ())
     model = mujoco.MjModel.from_xml_string(mjcf(world))
@@ -119,7 +119,7 @@ def test_the_simulator_reads_the_world(tmp_path: Path) -> None:
     assert world.half_x == pytest.approx(HALF_M)
 
 
-def test_what_is_nearest_is_named() -> None:
+def test_the_nearest_thing_is_named() -> None:
     world = ClutteredWorld(
         0, (Part(0, 1.0, 0.0, 0.1, 0.1, 0.1),), ("box",), (Pit(-1.0, 0.0, 0.1, 0.1, 0.1),),
         Pose(x=0.0, y=0.0, yaw=0.0), (), (),
@@ -142,7 +142,7 @@ def test_other_seeds_are_refused(text: str) -> None:
         seeds_of(text)
 
 
-def test_a_world_passes_only_unharmed_and_with_eight_goals() -> None:
+def test_a_world_passes_only_without_harm_and_with_eight_goals() -> None:
     assert RUN.ok
     assert replace(RUN, reached=8).ok
     assert not replace(RUN, reached=7).ok
@@ -180,7 +180,7 @@ def test_the_table_has_a_column_for_each_way_of_driving() -> None:
     console.print(_clutter_table(ClutterResult(body="b", speed=3.0, seconds=120.0)))
 
 
-def test_an_incident_says_what_where_and_when() -> None:
+def test_the_text_of_an_incident_names_kind_and_place() -> None:
     one = Incident(what="fall", near="pit", at=Pose(x=1.0, y=-0.5, yaw=0.0), seconds=12.34)
     text = in_words(replace(RUN, falls=1, incidents=(one,)))
     assert "fall" in text

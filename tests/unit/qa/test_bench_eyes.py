@@ -1,4 +1,4 @@
-"""The benchmark of eyes: its worlds, how it judges, and what it prints."""
+"""The benchmark of eyes: its worlds, its judgement, and its table."""
 
 import math
 
@@ -34,7 +34,7 @@ def _graphics() -> None:
 
 
 @pytest.mark.long
-def test_worlds_repeat_and_are_all_other() -> None:
+def test_worlds_repeat_and_differ_by_seed() -> None:
     assert draw_world(3) == draw_world(3)
     assert len({draw_world(seed) for seed in range(20)}) == 20
 
@@ -50,7 +50,7 @@ def test_things_stand_apart_from_each_other_and_from_the_robot() -> None:
             assert distances([one.outline], np.zeros((1, 2)))[0] > 0.2
 
 
-def test_width_is_that_across_the_line_of_sight() -> None:
+def test_the_width_is_measured_across_the_line_of_sight() -> None:
     along = np.column_stack((np.linspace(1, 2, 9), np.linspace(1, 2, 9), np.zeros(9)))
     assert bench._width(along, STILL) == pytest.approx(0.0, abs=1e-9)
     assert bench._width(along, Pose(x=3.0, y=0.0, yaw=1.0)) == pytest.approx(math.sqrt(2))
@@ -64,7 +64,7 @@ def test_outlines_are_counter_clockwise_and_of_the_right_size() -> None:
     assert area(post.outline) == pytest.approx(math.pi * 0.01, rel=0.02)
 
 
-def test_ghosts_are_timed_from_when_they_are_seen_to_be_gone() -> None:
+def test_a_ghost_is_timed_from_the_first_view_of_the_empty_place() -> None:
     for kind in bench.GHOST_KINDS:
         story = list(bench._ghost_story(kind, STILL))
         times = [now for now, *_ in story]
@@ -99,14 +99,14 @@ def test_a_small_run_prints_every_figure() -> None:
     assert sensor.false_per_min == 0.0
     assert max(sensor.ghost_max_s, ideal.ghost_max_s) <= 0.5
     console = Console(width=140)
-    with console.capture() as said:
+    with console.capture() as output:
         console.print(_eyes_table(result))
-    assert "1 worlds from seed 4" in said.get()
+    assert "1 worlds from seed 4" in output.get()
 
 
 @pytest.mark.long
 @pytest.mark.usefixtures("_graphics")
-def test_contours_that_are_wrong_count_as_wrong() -> None:
+def test_wrong_contours_count_as_wrong() -> None:
     body = bodies()[0]
     seen = bench.Eyes(body, NO_ERRORS, 0)
     thing, elsewhere = Part(0, 1.5, 0.0, 0.1, 0.1, 0.3), Part(0, 1.0, 0.4, 0.1, 0.1, 0.3)
@@ -126,6 +126,6 @@ def test_contours_that_are_wrong_count_as_wrong() -> None:
 
 
 @pytest.mark.parametrize("wrong", [{"worlds": 0}, {"seconds": 0.0}, {"ghosts": -1}])
-def test_what_cannot_be_measured_is_refused(wrong: dict[str, int]) -> None:
+def test_wrong_options_are_refused(wrong: dict[str, int]) -> None:
     with pytest.raises(ConfigError, match="--"):
         eyes(**wrong)

@@ -1,4 +1,4 @@
-"""Calculation of figures: percentiles, rounds, hops and timed scans."""
+"""Calculation of figures: percentiles, rounds, hops and latencies of scans."""
 
 import pytest
 from hypothesis import given
@@ -22,18 +22,18 @@ MS = 1_000_000
     ("count", "share", "expected"),
     [(1, 0.99, 1), (2, 0.50, 1), (3, 0.50, 2), (100, 0.50, 50), (100, 0.99, 99), (101, 0.99, 100)],
 )
-def test_a_percentile_is_a_value_that_was_measured(
+def test_a_percentile_is_one_of_the_measured_values(
     count: int, share: float, expected: float
 ) -> None:
     assert percentile(range(1, count + 1), share) == expected
 
 
-def test_nothing_has_no_percentile() -> None:
+def test_without_values_there_is_no_percentile() -> None:
     assert percentile([], 0.5) is None
     assert NewestValues(3).percentile(0.5) is None
 
 
-def test_the_oldest_value_gives_way() -> None:
+def test_a_new_value_replaces_the_oldest() -> None:
     newest = NewestValues(3)
     for value in (5.0, 1.0, 9.0, 2.0):
         newest.add(value)
@@ -42,16 +42,16 @@ def test_the_oldest_value_gives_way() -> None:
 
 
 @given(st.lists(st.floats(0, 9), min_size=1), st.integers(1, 9), st.floats(0, 1))
-def test_the_newest_values_are_those_that_came_last(
-    values: list[float], most: int, share: float
+def test_the_percentile_is_that_of_the_newest_values(
+    values: list[float], size: int, share: float
 ) -> None:
-    newest = NewestValues(most)
+    newest = NewestValues(size)
     for value in values:
         newest.add(value)
-    assert newest.percentile(share) == percentile(sorted(values[-most:]), share)
+    assert newest.percentile(share) == percentile(sorted(values[-size:]), share)
 
 
-def test_a_run_that_measured_nothing_is_no_result() -> None:
+def test_a_run_without_measurements_is_refused() -> None:
     assert latencies([0.4, 0.2, 0.3]) == one(3, 0.3, 0.4)
     with pytest.raises(GigabrainError, match="nothing came back"):
         latencies([])
@@ -66,12 +66,12 @@ def test_a_ratio_is_ours_over_the_bare_relays() -> None:
     assert compared().ratio_p99 == pytest.approx(1.5 / 0.9)
 
 
-def test_what_a_hop_does_not_do_itself_is_the_rest() -> None:
+def test_the_rest_is_the_time_outside_a_hops_own_work() -> None:
     hop = Hop(name="scan → world", took=1.0, put=0.1, bridge=0.05, decode=0.02, step=0.23)
     assert hop.rest == pytest.approx(0.6)
 
 
-def test_work_is_timed_by_name_and_its_result_handed_on() -> None:
+def test_work_is_timed_by_name_and_its_result_is_returned() -> None:
     timed = HopTimer()
     assert timed("step", lambda: 7) == 7
     assert timed.median("step") >= 0.0
@@ -81,11 +81,11 @@ def test_work_is_timed_by_name_and_its_result_handed_on() -> None:
     assert timed.median("never done") == 0.0
 
 
-def test_a_hop_lasts_from_its_first_message_of_a_tick_to_the_next_ones() -> None:
+def test_a_hop_lasts_from_the_first_message_with_a_basis_to_the_next_topics() -> None:
     received = ChainMonitor()
     for tick, left_ms in ((5, 100), (10, 200), (15, 300)):
         received.add("robot/scan", CmdVel(linear_x=0.0, basis=tick, stamp_ns=left_ms * MS))
-    for tick, left_ms in ((5, 101), (10, 203), (10, 220)):  # the last repeats what it rests on
+    for tick, left_ms in ((5, 101), (10, 203), (10, 220)):  # the last repeats a basis
         received.add("robot/cmd_vel", CmdVel(linear_x=0.0, basis=tick, stamp_ns=left_ms * MS))
     assert received.between(SCAN, CMD_VEL) == 2.0
     assert not received.complete
@@ -99,10 +99,10 @@ def test_the_relay_is_a_ring_with_one_source() -> None:
     assert roles[0].gets == roles[-1].puts
     assert [role.size for role in roles] == [1600, 240, 490, 125]
     assert [role.rate_hz for role in roles] == [50.0, 0.0, 0.0, 0.0]
-    assert [role.first for role in roles] == [True, False, False, True]  # as driver and control
+    assert [role.first for role in roles] == [True, False, False, True]  # like driver and control
 
 
-def test_a_scan_is_timed_until_the_first_command_that_rests_on_it() -> None:
+def test_a_scan_is_timed_until_the_first_command_that_is_based_on_it() -> None:
     trip = RoundTrip()
     trip.sent(5, 100 * MS)
     trip.answered(0, 101 * MS, counts=True)

@@ -61,14 +61,14 @@ def test_one_goal_in_a_hundred_may_be_missed_and_nothing_may_be_touched() -> Non
     assert not GoalsResult(seed=0, runs=(GOOD, replace(GOOD, contacts=1))).ok
 
 
-def test_whoever_is_not_there_has_not_reached_it_whatever_it_says() -> None:
+def test_a_goal_that_is_wrongly_reported_as_reached_is_missed() -> None:
     assert missed_by(GoalError(9.8, None)) == "reported as reached, 9.80 m from the goal"
     assert missed_by(GoalError(0.1, 3.0)) == "reported as reached, 172 degrees from the heading"
     assert not missed_by(GoalError(0.3, None))
     assert not missed_by(GoalError(0.3, 0.2))
 
 
-async def test_a_question_that_the_host_has_slept_through_is_asked_again(
+async def test_a_goal_is_sent_again_when_a_busy_host_does_not_reply(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     asked: list[float] = []
@@ -89,17 +89,17 @@ async def test_a_question_that_the_host_has_slept_through_is_asked_again(
     assert asked == [2.0, 2.0, 2.0]
 
 
-async def test_a_robot_that_a_person_has_shut_in_is_sent_on_when_the_person_has_gone(
+async def test_a_random_goal_is_drawn_again_while_a_person_blocks_the_way(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    looks: list[GigabrainError | tuple[float, float]] = [
+    places: list[GigabrainError | tuple[float, float]] = [
         GigabrainError("no place can be reached"),
         GigabrainError("none"),
         (1.0, 2.0),
     ]
 
     async def random_place(_: GoalSender) -> tuple[float, float]:
-        found = looks.pop(0)
+        found = places.pop(0)
         if isinstance(found, GigabrainError):
             raise found
         return found
@@ -112,7 +112,7 @@ async def test_a_robot_that_a_person_has_shut_in_is_sent_on_when_the_person_has_
     sender = GoalSender(Net().two, cast("ProcessGroup", Alive()), seed=0)
     assert await sender._retried(GigabrainError, sender._random_place) == (1.0, 2.0)
     monkeypatch.setattr(goals, "MAX_SILENCE_S", 0.0)
-    looks.extend([GigabrainError("none")] * 100)
+    places.extend([GigabrainError("none")] * 100)
     with pytest.raises(GigabrainError, match="none"):
         await sender._retried(GigabrainError, sender._random_place)
 
@@ -140,7 +140,7 @@ def test_a_body_that_drives_for_hours_has_a_large_battery(tmp_path: Path) -> Non
     assert (copy.parent / "model.xml").is_file()
 
 
-def test_the_table_says_what_was_measured() -> None:
+def test_the_table_shows_the_figures() -> None:
     lines = _text(GoalsResult(seed=7, runs=(replace(GOOD, body="turtlebot3_waffle"),)))
     for figure in ("seed 7", "x5", "99/100", "0.090", "10.0", "0.11", "5.7"):
         assert figure in lines

@@ -1,4 +1,4 @@
-"""Remembered things against the truth: which count, and what is not there."""
+"""Remembered things compared with the true ones."""
 
 import math
 from pathlib import Path
@@ -11,16 +11,16 @@ from gigabrain_schemas.objects import MapObject
 from gigabrain_zenoh.geometry.pose import compose, inverse
 from gigabrain_zenoh.qa.bench.objects import CLASSES, HALF_M, THINGS, draw, judged, write
 
-FRAME = Pose(x=1.0, y=-0.5, yaw=0.7)  # of the map, in the world
+FRAME = Pose(x=1.0, y=-0.5, yaw=0.7)  # pose of the map in the world
 
 
 def remembered(label: str, x: float, y: float) -> MapObject:
-    """Return a thing at a place of the world, as the robot has it in its map."""
+    """Return the map's object for a thing at a place in the world [m]."""
     at = compose(inverse(FRAME), Pose(x=x, y=y, yaw=0.0))
     return MapObject(id=1, label=label, x=at.x, y=at.y, z=0.1, size=(0.1, 0.1), confidence=0.9)
 
 
-def test_what_is_remembered_as_what_it_is_counts_and_everything_else_is_not_there() -> None:
+def test_a_thing_counts_only_with_its_class_and_place() -> None:
     placed, _ = draw(3)
     one, other = placed[0], placed[1]
     found, errors, false = judged(

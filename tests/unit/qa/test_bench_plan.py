@@ -1,4 +1,4 @@
-"""The benchmark of planning: its maps, its figures, and what it says."""
+"""The benchmark of planning: its maps, its figures, and its table."""
 
 from pathlib import Path
 
@@ -25,7 +25,7 @@ def test_every_path_is_as_cheap_as_dijkstras(measured: tuple[PlanResult, Path]) 
     assert 12.0 <= size.path_m <= 16.5  # it costs as much as 15 m in the open, within a tenth
 
 
-def test_each_figure_is_there_and_in_order(measured: tuple[PlanResult, Path]) -> None:
+def test_all_timings_are_complete_and_ordered(measured: tuple[PlanResult, Path]) -> None:
     (size,) = measured[0].sizes
     assert [one.n for one in size.timings] == [7, 7, 7, 3, 3, 9, 3, 7, 7]
     assert all(0 < one.p50_ms <= one.p95_ms for one in size.timings)
@@ -35,21 +35,23 @@ def test_the_picture_shows_the_map(measured: tuple[PlanResult, Path]) -> None:
     assert measured[1].read_bytes().startswith(b"\x89PNG")
 
 
-def test_a_path_that_is_dearer_is_not_ok(measured: tuple[PlanResult, Path]) -> None:
+def test_a_costlier_path_is_not_ok(measured: tuple[PlanResult, Path]) -> None:
     (size,) = measured[0].sizes
-    dearer = PlanResult(seed=0, sizes=(type(size)(size=400, path_m=1.0, timings=(), ratio=1.001),))
-    assert not dearer.ok
+    costlier = PlanResult(
+        seed=0, sizes=(type(size)(size=400, path_m=1.0, timings=(), ratio=1.001),)
+    )
+    assert not costlier.ok
 
 
-def test_published_figures_are_said_to_be_that(measured: tuple[PlanResult, Path]) -> None:
+def test_published_figures_are_marked(measured: tuple[PlanResult, Path]) -> None:
     console = Console(width=140)
-    with console.capture() as said:
+    with console.capture() as output:
         console.print(_plan_table(measured[0]))
-    assert "published │ Nav2 NavFn, about 75 m" in said.get()
-    assert "other machines" in said.get()
+    assert "published │ Nav2 NavFn, about 75 m" in output.get()
+    assert "other machines" in output.get()
 
 
-def test_the_maps_repeat_and_are_as_described() -> None:
+def test_the_maps_repeat_and_have_the_described_density() -> None:
     one, other = (office(500, np.random.default_rng(3)) for _ in range(2))
     np.testing.assert_array_equal(one, other)
     assert 0.05 < (one == 100).mean() < 0.3
@@ -57,6 +59,6 @@ def test_the_maps_repeat_and_are_as_described() -> None:
 
 
 @pytest.mark.parametrize(("size", "queries"), [((100,), 3), ((400,), 0)])
-def test_what_cannot_be_measured_is_refused(size: tuple[int, ...], queries: int) -> None:
+def test_wrong_options_are_refused(size: tuple[int, ...], queries: int) -> None:
     with pytest.raises(ConfigError, match="--"):
         plan(size=size, queries=queries)

@@ -1,4 +1,4 @@
-"""The verdict of `gigabrain bench robots`, and for how long a gate was shut."""
+"""The verdict of `gigabrain bench robots`, and the share of time with a shut gate."""
 
 import pytest
 from msgspec.structs import replace
@@ -30,14 +30,14 @@ def result(*robots: FleetRobot) -> RobotsResult:
         ([gate(10, "enabled"), gate(1200, "idle")], 0.0),
     ],
 )
-def test_a_gate_counts_as_shut_within_the_measured_time_only(
+def test_the_shut_share_covers_only_the_measured_time(
     records: list[dict[str, object]], share: float
 ) -> None:
     assert shut_share(records, 10.0, 20.0) == pytest.approx(share)  # ticks 500 to 1000
 
 
 @pytest.mark.parametrize(
-    ("slow", "why"),
+    ("slow", "reason"),
     [
         (replace(FAST, number=2, p99_ms=83.0), "scan to command took 83 ms (p99)"),
         (replace(FAST, number=2, p99_ms=None), "no scan was answered"),
@@ -45,14 +45,14 @@ def test_a_gate_counts_as_shut_within_the_measured_time_only(
         (replace(FAST, number=2, stood=0.2), "it stood for 20% of the time"),
     ],
 )
-def test_it_says_for_which_robot_the_machine_is_too_small(slow: FleetRobot, why: str) -> None:
+def test_the_verdict_names_the_robot_that_is_too_slow(slow: FleetRobot, reason: str) -> None:
     found = result(FAST, slow)
     assert found.verdict.startswith("this machine is too small for 2 of these robots: robot 2: ")
-    assert why in found.verdict
+    assert reason in found.verdict
     assert not found.ok
 
 
-def test_a_robot_that_fails_is_reported_and_alone_says_nothing_of_the_machine() -> None:
+def test_a_failed_robot_is_reported_but_is_no_sign_of_a_small_machine() -> None:
     failed = FleetRobot(number=2, problem="a process died")
     found = result(FAST, failed)
     assert found.verdict == "1 of these 2 robots failed: robot 2: a process died"
@@ -62,12 +62,12 @@ def test_a_robot_that_fails_is_reported_and_alone_says_nothing_of_the_machine() 
     assert slow.verdict.startswith("this machine is too small")
 
 
-def test_a_contact_is_no_matter_of_size() -> None:
+def test_a_contact_is_not_a_sign_of_a_small_machine() -> None:
     found = result(FAST, replace(FAST, number=2, contacts=3))
     assert found.verdict == "this machine carries 2 of these robots, but they had 3 contacts"
     assert not found.ok
 
 
-def test_it_says_that_the_machine_carries_them() -> None:
+def test_the_verdict_for_a_large_machine() -> None:
     assert result(FAST).verdict == "this machine carries 1 of these robots"
     assert result(FAST).ok

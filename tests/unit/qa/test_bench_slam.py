@@ -1,4 +1,4 @@
-"""The SLAM benchmark: relations, what it refuses, and a short log."""
+"""The SLAM benchmark: relations, refused logs, and recorded logs."""
 
 import os
 from pathlib import Path
@@ -24,7 +24,7 @@ DATA = os.environ.get("GIGABRAIN_DATA")
 
 
 def circles(scans: int = 120, radius: float = 8.0) -> Floats:
-    """Two laps of a circle."""
+    """Return the poses (n, 3) of two laps of a circle."""
     turned = np.linspace(0, 4 * np.pi, scans, endpoint=False)
     ahead = turned + np.pi / 2
     return np.column_stack((radius * np.cos(turned), radius * np.sin(turned), ahead))
@@ -35,7 +35,7 @@ def log(reference: Floats) -> LaserLog:
 
 
 @pytest.mark.long
-def test_relations_are_near_in_place_and_far_in_time() -> None:
+def test_relations_are_close_in_space_and_distant_in_time() -> None:
     reference = circles()
     pairs = relations(log(reference))
     first, second = pairs.T
@@ -57,7 +57,7 @@ def test_a_map_in_another_frame_has_no_error_and_a_bent_one_has() -> None:
 
 
 def wall_from(poses: Floats) -> LaserLog:
-    """A wall along y = 2.03 m, as seen from `poses` (n, 3) that look along x."""
+    """Return the log of a wall along y = 2.03 m, from `poses` (n, 3) that look along x."""
     angles = np.radians(-90.0 + np.arange(180))
     ahead = (angles > 0.3) & (angles < 1.5)
     ranges = np.where(ahead, (2.03 - poses[:, 1:2]) / np.sin(np.where(ahead, angles, 1.0)), 50.0)
@@ -137,7 +137,7 @@ def test_edmonton_is_mapped_within_7_cm_of_its_reference() -> None:
 @pytest.mark.slow
 @pytest.mark.skipif(not DATA, reason="GIGABRAIN_DATA does not name the folder of laser logs")
 def test_freiburg_is_mapped_where_its_odometry_has_the_wrong_sign() -> None:
-    """Of every fourth scan: a stretch of it is driven backwards, and odometry says forwards."""
+    """Uses every fourth scan. The robot partly drives backwards, but odometry has forwards."""
     dense = load(Path(str(DATA)) / "slam" / "freiburg-079.npz")
     thin = LaserLog("thin", *(a[:2000:4] for a in (dense.ranges, dense.reference, dense.odometry)))
     result = judge_log(thin, map_log(thin, lambda: None))
@@ -148,7 +148,7 @@ def test_freiburg_is_mapped_where_its_odometry_has_the_wrong_sign() -> None:
 @pytest.mark.slow
 @pytest.mark.skipif(not DATA, reason="GIGABRAIN_DATA does not name the folder of laser logs")
 def test_long_corridors_do_not_cross() -> None:
-    """After 600 m without a loop the robot comes back 16 m from where it is thought to be."""
+    """After 600 m without a loop, the estimated pose is 16 m off."""
     recorded = load(Path(str(DATA)) / "slam" / "infinite-corridor.npz")
     result = judge_log(recorded, map_log(recorded, lambda: None))
     assert result.crispness < 1.0
@@ -157,8 +157,8 @@ def test_long_corridors_do_not_cross() -> None:
 
 @pytest.mark.slow
 @pytest.mark.skipif(not DATA, reason="GIGABRAIN_DATA does not name the folder of laser logs")
-def test_leaves_and_slopes_do_not_end_a_map_outdoors() -> None:
-    """Scans that fit nothing broke it eight times, and gtsam raised at scan 976."""
+def test_leaves_and_slopes_do_not_break_a_map_outdoors() -> None:
+    """Scans without a match once broke it eight times, and gtsam raised an error at scan 976."""
     whole = load(Path(str(DATA)) / "slam" / "freiburg-campus.npz")
     part = LaserLog("part", *(a[:1000] for a in (whole.ranges, whole.reference, whole.odometry)))
     assert judge_log(part, map_log(part, lambda: None)).breaks == 0

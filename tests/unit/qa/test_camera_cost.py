@@ -33,12 +33,12 @@ COST = CameraCost(
 )
 
 
-def test_what_is_added_is_the_difference_without_rendering() -> None:
+def test_the_added_cost_is_the_difference_without_rendering() -> None:
     assert COST.added_cpu == pytest.approx(0.15)
     assert COST.added_pss_bytes == 110_000_000
 
 
-def test_the_table_has_every_process_and_bears_a_robot_without_pictures() -> None:
+def test_the_table_has_every_process_and_works_without_latencies() -> None:
     def cells(cost: CameraCost) -> Iterator[str]:
         for column in cameras_table(cost).columns:
             yield from (str(cell) for cell in column.cells)
@@ -47,11 +47,11 @@ def test_the_table_has_every_process_and_bears_a_robot_without_pictures() -> Non
     assert "p50 0.0" in cells(replace(COST, latency_ms=()))
 
 
-def test_this_process_has_memory() -> None:
+def test_the_memory_of_this_process_is_plausible() -> None:
     assert 1_000_000 < pss_of(os.getpid()) < 10_000_000_000
 
 
-async def test_each_exposure_is_timed_once_by_its_camera() -> None:
+async def test_each_exposure_of_a_camera_is_timed_once() -> None:
     net = Net()
     latencies = Latencies(net.bus("bench"))
     planes = (b"", b"", b"", b"")

@@ -17,13 +17,13 @@ from gigabrain_zenoh.qa.proxy.chaos import (
 def damaged(
     chaos: Chaos, pieces: list[bytes], seed: int = 0
 ) -> tuple[bytes, list[float], WayCounters]:
-    """All that arrives of `pieces`, one each 10 ms, and when."""
+    """Return the received bytes of `pieces`, sent 10 ms apart, with arrival times and counters."""
     damage = LinkDamage(random.Random(seed), WayCounters())
     out = [out for n, piece in enumerate(pieces) for out in damage.damaged(piece, chaos, n / 100)]
     return b"".join(data for _, data in out), [due_s for due_s, _ in out], damage.figures
 
 
-def test_a_bit_is_flipped_in_as_many_bytes_as_is_said() -> None:
+def test_the_share_of_flipped_bits_is_as_set() -> None:
     pieces = [bytes(1000)] * 1000
     data, _, figures = damaged(Chaos(corrupt=1e-3), pieces)
     assert figures.flipped == sum(byte != 0 for byte in data) == 1024
@@ -34,35 +34,35 @@ def test_a_bit_is_flipped_in_as_many_bytes_as_is_said() -> None:
     assert damaged(Chaos(corrupt=5e-324), pieces)[2].flipped == 0
 
 
-def test_what_is_dropped_does_not_arrive_and_is_counted() -> None:
+def test_dropped_pieces_do_not_arrive_and_are_counted() -> None:
     data, _, figures = damaged(Chaos(drop=0.25), [b"0123456789"] * 1000)
     assert len(data) == 10_000 - figures.dropped == 7420
     assert figures.taken == 10_000
 
 
-def test_garbage_comes_before_what_was_sent() -> None:
+def test_garbage_precedes_each_piece() -> None:
     data, _, figures = damaged(Chaos(garbage=1.0), [b"frame"] * 10)
     assert data.count(b"frame") == 10
     assert len(data) == 50 + figures.garbage
     assert 10 <= figures.garbage <= 640
 
 
-def test_what_is_split_comes_in_two_halves() -> None:
+def test_a_split_piece_arrives_in_two_halves() -> None:
     data, times, _ = damaged(Chaos(split=1.0), [b"01234567"])
     assert (data, times) == (b"01234567", [0.0, 0.002])
 
 
-def test_what_is_merged_comes_at_one_time() -> None:
+def test_merged_pieces_arrive_at_the_same_time() -> None:
     _, times, _ = damaged(Chaos(merge_ms=50), [b"a"] * 6)
     assert times == pytest.approx([0.0, 0.05, 0.05, 0.05, 0.05, 0.05])
 
 
-def test_a_throttled_line_takes_as_long_as_it_says() -> None:
+def test_a_throttled_line_keeps_its_rate() -> None:
     _, times, _ = damaged(Chaos(bytes_s=1000), [bytes(100), bytes(100)])
     assert times == pytest.approx([n * 0.02 for n in range(1, 11)])
 
 
-def test_what_is_lost_is_late_and_so_is_what_comes_after_it() -> None:
+def test_a_lost_piece_is_late_and_so_are_those_after_it() -> None:
     chaos = Chaos(loss=0.2)
     _, times, figures = damaged(chaos, [b"x"] * 200)
     assert figures.late == 37
@@ -71,7 +71,7 @@ def test_what_is_lost_is_late_and_so_is_what_comes_after_it() -> None:
 
 
 @pytest.mark.parametrize(
-    ("line", "wish"),
+    ("line", "command"),
     [
         ("", ProxyCommand(ways=("up", "down"))),
         ("off", ProxyCommand(ways=("up", "down"))),
@@ -88,8 +88,8 @@ def test_what_is_lost_is_late_and_so_is_what_comes_after_it() -> None:
         ("figures", ProxyCommand(figures=True)),
     ],
 )
-def test_what_is_typed_is_understood(line: str, wish: ProxyCommand) -> None:
-    assert parse_command(line) == wish
+def test_a_command_is_parsed(line: str, command: ProxyCommand) -> None:
+    assert parse_command(line) == command
 
 
 @pytest.mark.parametrize(
@@ -101,6 +101,6 @@ def test_what_is_typed_is_understood(line: str, wish: ProxyCommand) -> None:
         ("hole cut", "no fault 'cut'"),
     ],
 )
-def test_what_cannot_be_understood_is_refused_in_one_line(line: str, complaint: str) -> None:
+def test_a_wrong_command_is_refused_in_one_line(line: str, complaint: str) -> None:
     with pytest.raises(ConfigError, match=complaint):
         parse_command(line)

@@ -1,4 +1,4 @@
-"""The order of rooms is judged: by import-linter, and in strings by a lint of our own."""
+"""The check of module names in strings against the order of rooms, and the sizes of code."""
 
 import shutil
 from pathlib import Path
@@ -12,7 +12,7 @@ SKIPPED = shutil.ignore_patterns("__pycache__", "*.js", "*.svg")
 
 @pytest.fixture(scope="module")
 def copy(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A copy of the product's sources in which a test may break one file at a time."""
+    """Return a copy of the product's sources, in which a test breaks one file at a time."""
     folder = tmp_path_factory.mktemp("copy")
     for package in house.PACKAGES:
         shutil.copytree(house.ROOT / package, folder / package, ignore=SKIPPED)

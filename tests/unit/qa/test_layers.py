@@ -1,6 +1,6 @@
-"""Third-party SDKs stay behind one module each, and functions fit on a screen.
+"""Third-party SDKs are only imported by their own modules, and functions fit on a screen.
 
-Which room may import which is in pyproject.toml, for import-linter.
+The order of rooms is in pyproject.toml, for import-linter.
 """
 
 import ast

@@ -1,4 +1,4 @@
-"""The relay of other frameworks: what is installed, and what its processes measure and pass on."""
+"""The relay of other frameworks: finding them, their measurements, and forwarding."""
 
 import json
 from pathlib import Path
@@ -16,7 +16,7 @@ def command(folder: Path, name: str, first_line: str) -> str:
     return str(path)
 
 
-def test_what_is_on_the_path_runs_by_the_interpreter_of_its_command(
+def test_a_framework_on_the_path_has_the_interpreter_of_its_command(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("PATH", str(tmp_path))
@@ -37,11 +37,11 @@ def test_a_command_that_is_no_script_is_named(
 
 
 @pytest.mark.parametrize("size", [3, 8, 12])
-def test_what_is_passed_on_has_the_size_of_the_next_hop(size: int) -> None:
+def test_a_forwarded_message_has_the_size_of_the_next_hop(size: int) -> None:
     assert peer_node.passed_on(b"12345678", size) == b"12345678\0\0\0\0"[:size]
 
 
-def test_times_count_from_the_first_message_back_and_after_the_time_to_settle(
+def test_times_count_after_the_settling_time_from_the_first_returned_message(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     clock = 1_000_000_000

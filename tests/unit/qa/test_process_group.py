@@ -1,4 +1,4 @@
-"""Processes of a measurement: which of them ended it, and why."""
+"""Processes of a measurement: the error of the one that ended it."""
 
 import pytest
 

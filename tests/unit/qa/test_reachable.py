@@ -1,4 +1,4 @@
-"""Goals of `bench goals --headings`: what a body can reach by its own motions, and what not."""
+"""Goals of `bench goals --headings`: poses that a body's motions can reach."""
 
 import math
 
@@ -35,7 +35,7 @@ def test_in_a_wide_room_every_heading_is_reached(body: BodyDescription) -> None:
 
 
 @pytest.mark.long
-def test_poses_keep_away_from_what_stands() -> None:
+def test_poses_keep_away_from_obstacles() -> None:
     poses = reachable_poses(LONG, lane(Box(0.5, 0.0, 0.2, 0.2, 0.5)))
     for x, y, yaw in poses.tolist():
         for ahead in (-0.3, 0.0, 0.3):
@@ -43,7 +43,7 @@ def test_poses_keep_away_from_what_stands() -> None:
             assert max(abs(at_x - 0.5), abs(at_y)) > 0.25
 
 
-def test_in_a_narrow_lane_nobody_turns() -> None:
+def test_in_a_narrow_lane_no_body_turns_round() -> None:
     for body in (LONG, SIDEWAYS, CAR):
         poses = reachable_poses(body, lane(half_y=0.3))
         assert not turned_round(poses)
@@ -51,7 +51,7 @@ def test_in_a_narrow_lane_nobody_turns() -> None:
 
 
 @pytest.mark.long
-def test_only_a_body_that_strafes_gets_into_a_niche_beside_a_lane() -> None:
+def test_only_a_body_with_lateral_motion_reaches_a_niche_beside_a_lane() -> None:
     """The niche is 1 m long and as deep as the body is wide; the lane is too narrow to turn in."""
     beside = (Box(-1.25, 0.6, 0.75, 0.3, 0.5), Box(1.25, 0.6, 0.75, 0.3, 0.5))
     world = lane(*beside, Box(0.0, -0.6, 2.0, 0.3, 0.5), half_y=0.9)

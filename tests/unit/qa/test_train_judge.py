@@ -1,4 +1,4 @@
-"""Average precision beside that of `hotcoco`, an independent judge, on random findings."""
+"""Average precision compared with that of the independent `hotcoco`, on random findings."""
 
 import json
 
@@ -13,7 +13,7 @@ judge = pytest.importorskip("hotcoco")
 
 
 def random_case(rng, pictures):
-    """Pictures with things, some ignored; findings near them, twice, of wrong class, or nowhere."""
+    """Return random findings and truths: some ignored, found twice, wrong, or missed."""
     truths, guesses = [], []
     for _ in range(pictures):
         n = int(rng.integers(0, 6))
@@ -32,7 +32,7 @@ def random_case(rng, pictures):
 
 
 def judged(guesses, truths, folder):
-    """AP at an overlap of a half of each class, by hotcoco."""
+    """Return hotcoco's average precision of each class at an IoU of 0.5."""
     annotations, results = [], []
     for image, (guess, truth) in enumerate(zip(guesses, truths, strict=True), 1):
         for box, label, ignored in zip(truth.boxes, truth.labels, truth.ignored, strict=True):

@@ -27,7 +27,7 @@ def test_a_box_is_never_as_high_as_wide(wide):
         assert z < 0.85 * min(x, y) or z > 1.15 * max(x, y)
 
 
-def test_a_box_in_training_is_clearly_no_cube():
+def test_a_box_in_training_is_clearly_not_a_cube():
     for seed in DRAWS:
         x, y, z = box(np.random.default_rng(seed), 0).parts[0].size
         assert z <= 0.62 * min(x, y) or z >= 1.6 * max(x, y)
@@ -57,7 +57,7 @@ def test_distractors_have_no_label():
     assert sum(map(distractors.is_table, distractors.draw_all(np.random.default_rng(1)))) == 2
 
 
-def test_patterned_textures_of_tests_are_none_of_those_of_training():
+def test_patterned_textures_of_tests_are_not_used_in_training():
     assert set(textures.TRAIN) & set(textures.TEST) == {textures.plain}
 
 

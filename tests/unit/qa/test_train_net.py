@@ -1,4 +1,4 @@
-"""The net in TensorFlow and as ONNX is one; needs the extra `train`, and onnxruntime as a judge."""
+"""The net gives the same result in TensorFlow and as ONNX; needs the extra `train`."""
 
 import numpy as np
 import pytest
@@ -16,8 +16,8 @@ from gigabrain_zenoh.vision.recognizer import Recognizer
 MAX_PARAMETERS, MAX_BYTES = 400_000, 2_000_000
 
 
-def some_net():
-    """A net whose normalisation does something."""
+def net_with_moments():
+    """Return a net with random moments, so that normalisation has an effect."""
     params, moments = net.init(0)
     rng = np.random.default_rng(0)
     for own in moments.values():
@@ -26,9 +26,9 @@ def some_net():
     return params, moments
 
 
-def test_the_exported_net_answers_as_the_trained_one_and_is_small(tmp_path):
+def test_the_exported_net_gives_the_same_output_and_is_small(tmp_path):
     runtime = pytest.importorskip("onnxruntime")
-    params, moments = some_net()
+    params, moments = net_with_moments()
     path = tmp_path / "net.onnx"
     export(params, moments, path)
     assert net.parameters(params) <= MAX_PARAMETERS
@@ -43,7 +43,7 @@ def test_the_exported_net_answers_as_the_trained_one_and_is_small(tmp_path):
     assert np.abs(np.asarray(ours).transpose(0, 3, 1, 2) - theirs).max() < 1e-3
 
 
-def test_boxes_of_raw_distances_are_those_that_the_runner_decodes(tmp_path):
+def test_training_and_the_recogniser_decode_the_same_boxes(tmp_path):
     raw = np.random.default_rng(2).normal(0, 1, (1, 30, 40, 4)).astype(np.float32)
     box = np.asarray(learning.corners(raw))[0, 15, 20]
     cells = np.full((13, 30, 40), -9.0, np.float32)
@@ -53,7 +53,7 @@ def test_boxes_of_raw_distances_are_those_that_the_runner_decodes(tmp_path):
     assert decode(cells).boxes[0] == pytest.approx(np.clip(box, 0, [320, 240, 320, 240]), abs=1e-3)
 
 
-def test_a_perfect_box_costs_nothing_and_one_apart_more_than_one_that_overlaps():
+def test_the_box_loss_is_zero_for_a_perfect_box_and_grows_with_the_error():
     wanted, weight = np.array([[[[0, 0, 10, 10]]]], np.float32), np.ones((1, 1, 1), np.float32)
     costs = [
         float(learning.box_loss(wanted + np.float32(shift), wanted, weight)) for shift in (0, 5, 50)
@@ -63,7 +63,7 @@ def test_a_perfect_box_costs_nothing_and_one_apart_more_than_one_that_overlaps()
 
 
 @pytest.mark.slow
-def test_training_goes_on_where_it_was_stopped_and_learns_one_picture(tmp_path, monkeypatch):
+def test_training_continues_from_a_checkpoint_and_learns_one_picture(tmp_path, monkeypatch):
     stages = (learning.Stage(0.5, 192, 144, 2), learning.Stage(1.0, 320, 240, 2))
     monkeypatch.setattr(learning, "STAGES", stages)
     monkeypatch.setattr(learning, "WARM_UP_STEPS", 5)

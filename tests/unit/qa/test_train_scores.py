@@ -1,4 +1,4 @@
-"""Average precision on cases that are worked out by hand."""
+"""Average precision on cases that were calculated by hand."""
 
 import numpy as np
 import pytest
@@ -21,15 +21,15 @@ def found(*pairs, label=0):
     return Found(boxes, np.full(len(pairs), label), sure)
 
 
-def test_all_found_and_nothing_else_is_1():
+def test_the_score_is_1_if_all_things_are_found_and_nothing_else():
     assert average_precision([found((BOX, 0.9))], [wanted(BOX)], 0) == 1.0
 
 
-def test_nothing_found_is_0():
+def test_the_score_is_0_if_nothing_is_found():
     assert average_precision([found()], [wanted(BOX)], 0) == 0.0
 
 
-def test_a_surer_wrong_box_halves_precision():
+def test_a_wrong_box_with_higher_confidence_halves_precision():
     guess = found((FAR, 0.9), (BOX, 0.8))
     assert average_precision([guess], [wanted(BOX)], 0) == pytest.approx(0.5)
 
@@ -45,7 +45,7 @@ def test_a_second_box_on_one_thing_is_wrong():
     assert average_precision([guess], truths, 0) == pytest.approx((51 + 50 * 2 / 3) / 101)
 
 
-def test_a_box_on_an_ignored_thing_counts_neither_way():
+def test_a_box_on_an_ignored_thing_does_not_count():
     truth = wanted(BOX, FAR, ignored=(1,))
     guess = found((FAR, 0.9), (BOX, 0.8))
     assert average_precision([guess], [truth], 0) == 1.0
@@ -62,7 +62,7 @@ def test_boxes_of_another_picture_or_class_do_not_count():
     assert average_precision([found((BOX, 0.9), label=1)], [wanted(BOX)], 0) == 0.0
 
 
-def test_a_class_that_is_nowhere_has_no_score():
+def test_a_class_without_things_has_no_score():
     scores = table([found((BOX, 0.9))], [wanted(BOX)])
     assert scores["cube"] == 1.0
     assert np.isnan(scores["door"])

@@ -21,8 +21,8 @@ def labelled(*things, ignored=()):
     return Labelled(jpeg, boxes, labels, np.ones(len(things), np.float32), flags)
 
 
-def answer(one):
-    """Return a perfect net's answer: logits by the heat, distances to the box's sides."""
+def perfect_output(one):
+    """Return a perfect net's output: logits by the heat, distances to the box's sides."""
     heat, _, boxes, weights = targets(one, 240, 320)
     rows, columns = np.indices(weights.shape) * 8 + 4
     middle = np.stack([columns, rows], -1)
@@ -33,14 +33,16 @@ def answer(one):
 
 
 @pytest.mark.parametrize("box", [(40, 60, 90, 200), (3, 4, 12, 14), (0, 0, 320, 240)])
-def test_a_perfect_answer_to_the_targets_is_decoded_to_the_same_box(box):
-    found = decode(answer(labelled(("can", box))))
+def test_perfect_output_is_decoded_to_the_same_box(box):
+    found = decode(perfect_output(labelled(("can", box))))
     assert found.names() == ("can",)
     assert found.boxes[0] == pytest.approx(box, abs=0.01)
 
 
 def test_a_small_thing_before_a_large_one_keeps_its_cells():
-    found = decode(answer(labelled(("person", (40, 0, 200, 240)), ("can", (110, 110, 130, 130)))))
+    found = decode(
+        perfect_output(labelled(("person", (40, 0, 200, 240)), ("can", (110, 110, 130, 130))))
+    )
     boxes = dict(zip(found.names(), found.boxes.tolist(), strict=True))
     assert boxes["can"] == pytest.approx([110, 110, 130, 130], abs=0.01)
 
@@ -54,7 +56,7 @@ def test_an_ignored_thing_is_masked_in_its_class_only():
 
 
 @pytest.mark.long
-def test_boxes_follow_what_is_in_the_changed_picture():
+def test_boxes_move_with_the_augmented_picture():
     one = labelled(("cube", (100, 60, 180, 160)))
     for seed in range(30):
         picture, changed = augment(np.random.default_rng(seed), one, 320, 240)
@@ -67,7 +69,7 @@ def test_boxes_follow_what_is_in_the_changed_picture():
 
 
 @pytest.mark.long
-def test_a_thing_that_is_nearly_cut_away_is_to_be_ignored():
+def test_a_thing_that_is_mostly_cropped_is_ignored():
     one = labelled(("cube", (0, 60, 60, 160)))
     changes = [augment(np.random.default_rng(seed), one, 320, 240)[1] for seed in range(60)]
     small = [c for c in changes if c.boxes[0, 2] - c.boxes[0, 0] < 20]
