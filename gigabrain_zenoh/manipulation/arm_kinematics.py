@@ -71,7 +71,7 @@ class ArmKinematics:
         self.gripper = next((one for one in joints if one.part == "gripper"), None)
         if not self.joints:
             raise ConfigError("this body has no joints of an arm")
-        self._spec, self.followers = _read(mjcf, [one.name for one in joints], tool)
+        self._spec, self.followers = _read_model(mjcf, [one.name for one in joints], tool)
         self._model = _compile(self._spec)
         self._data = mujoco.MjData(self._model)
         self.names = tuple(one.name for one in self.joints)
@@ -148,7 +148,7 @@ class ArmKinematics:
             model.body_parentid,
         )  # a root is a rigid part's first body
         above = [int(roots[parents[roots[body]]]) for body in range(model.nbody)]
-        near, found = self._near(), []
+        near, found = self._bodies_that_come_near(), []
         for one in range(1, model.nbody):
             for other in range(1, model.nbody):
                 joined = roots[other] and not roots[one] and above[other] == 0
@@ -157,7 +157,7 @@ class ArmKinematics:
                     found.append((str(model.body(one).name), str(model.body(other).name)))
         return found
 
-    def _near(self) -> set[tuple[int, int]]:
+    def _bodies_that_come_near(self) -> set[tuple[int, int]]:
         """Return the pairs of bodies (lower number first) that can come near each other."""
         spec = self.spec()
         for geom in spec.geoms:
@@ -199,7 +199,7 @@ class ArmKinematics:
             raise ConfigError("this arm has no gripper")
         pads = self._pads()
         positions = np.linspace(self.gripper.lower, self.gripper.upper, GRIPPER_STEPS)
-        faces = np.array([self._faces(position, pads) for position in positions])
+        faces = np.array([self._pad_faces(position, pads) for position in positions])
         return Opening(positions=positions, low=faces[:, 0], high=faces[:, 1])
 
     def _chain(self) -> Chain:
@@ -233,7 +233,7 @@ class ArmKinematics:
             found.append(name)
         return found
 
-    def _faces(self, gripper: float, pads: Sequence[str]) -> tuple[float, float]:
+    def _pad_faces(self, gripper: float, pads: Sequence[str]) -> tuple[float, float]:
         """Return the positions of the pads' inner faces along the tool's z axis [m]."""
         self._set(self._data, (self.lower + self.upper) / 2, gripper)
         mujoco.mj_kinematics(self._model, self._data)
@@ -301,7 +301,7 @@ class PostureSetter:
             data.qpos[joint] = self._rest[joint] + shift
 
 
-def _read(
+def _read_model(
     mjcf: str, joints: Sequence[str], tool: str
 ) -> tuple[mujoco.MjSpec, tuple[Follower, ...]]:
     """Return the model with only the given joints, its base at the origin, and followers."""
@@ -326,7 +326,7 @@ def _read(
     base = spec.body(BASE)
     if base is None or base.parent.name != "world":
         raise ConfigError(f"the arm's model has no body {BASE!r} in the world's body")
-    _keep(spec, joints, followers := _followers(spec, joints))
+    _prune(spec, joints, followers := _followers(spec, joints))
     for number, body in enumerate(spec.bodies):
         body.name = body.name or f"body {number}"
     base.pos, base.quat, base.alt.type = (0, 0, 0), (1, 0, 0, 0), mujoco.mjtOrientation(0)
@@ -342,7 +342,7 @@ def _followers(spec: mujoco.MjSpec, joints: Sequence[str]) -> tuple[Follower, ..
     return tuple(one for one in found if one.joint not in joints)
 
 
-def _keep(spec: mujoco.MjSpec, joints: Sequence[str], followers: Sequence[Follower]) -> None:
+def _prune(spec: mujoco.MjSpec, joints: Sequence[str], followers: Sequence[Follower]) -> None:
     """Delete unneeded elements, and all other joints: a base's wheels become rigid parts."""
     kept = {*joints, *(one.joint for one in followers)}
     for kind in (spec.keys, spec.equalities, spec.actuators, spec.sensors, spec.tendons):

@@ -112,15 +112,17 @@ class ArmPlanner:
         goal = self.tool_goal(point, pitch)
         if self._above_floor and hold is None:  # prefer a way on which safety does not slow it
             higher = self._checker([*things, *self._above_floor], None, gripper_at)
-            way = self._way_to(higher, goal, posture)
+            way = self._move_tool(higher, goal, posture)
             if isinstance(way, Plan):
                 return way
-        return self._way_to(self._checker(things, hold, gripper_at), goal, posture)
+        return self._move_tool(self._checker(things, hold, gripper_at), goal, posture)
 
-    def _way_to(self, checker: CollisionChecker, goal: ToolGoal, posture: Floats) -> Plan | NoWay:
+    def _move_tool(
+        self, checker: CollisionChecker, goal: ToolGoal, posture: Floats
+    ) -> Plan | NoWay:
         found = self._inverse.solve(goal, posture, checker.touches)
         if isinstance(found, OutOfReach):
-            return NoWay(reason=self._explained(found))
+            return NoWay(reason=self._explain(found))
         return self._move(checker, posture, found.posture)
 
     def tool_goal(self, point: Floats, pitch: float | None) -> ToolGoal:
@@ -179,7 +181,7 @@ class ArmPlanner:
         stand_off = self._stand_off(thing, posture) if may_drive else None
         if stand_off is not None and far > stand_off + MAX_EXCESS_M:
             return NoWay(reason=f"{thing.name}: too far", stand_off=stand_off)
-        found = self._picker().pick(thing, self._all(things), posture, without)
+        found = self._picker().pick(thing, self._with_surroundings(things), posture, without)
         if isinstance(found, NoWay):
             return replace(found, stand_off=stand_off)
         grip = next(phase.gripper for phase in found.phases if phase.name == "close")
@@ -194,7 +196,7 @@ class ArmPlanner:
         self, hold: Hold, target: Floats, things: Sequence[Thing], posture: Floats
     ) -> Plan | NoWay:
         """Plan to put down the held thing, with its middle at `target` (3,) [m]."""
-        around = self._all(things)
+        around = self._with_surroundings(things)
         found = self._picker().place(hold.thing, target, around, posture, hold.opening)
         return found if isinstance(found, NoWay) else Plan(phases=found.phases)
 
@@ -218,7 +220,7 @@ class ArmPlanner:
         pitches = PRESS_PITCHES if pitch is None else (pitch,)
         middle = target.position if isinstance(target, Thing) else target
         ways = [self._approach(middle, one) for one in pitches]
-        found = self._presser().press(target, ways, depth, self._all(things), posture)
+        found = self._presser().press(target, ways, depth, self._with_surroundings(things), posture)
         if isinstance(found, NoWay):
             return found
         return Plan(phases=found.phases, before=found.before)
@@ -319,13 +321,13 @@ class ArmPlanner:
             self._press_planner = PressPlanner(self.arm, self._inverse)
         return self._press_planner
 
-    def _all(self, things: Sequence[Thing]) -> list[Thing]:
+    def _with_surroundings(self, things: Sequence[Thing]) -> list[Thing]:
         return [*self._around, *things]
 
     def _checker(
         self, things: Sequence[Thing], hold: Hold | None, gripper_at: float | None
     ) -> CollisionChecker:
-        around = self._all(things)
+        around = self._with_surroundings(things)
         if hold is None:
             return CollisionChecker(self.arm, around, margin=MARGIN_M, gripper=gripper_at)
         return CollisionChecker(
@@ -347,7 +349,7 @@ class ArmPlanner:
         level = math.cos(pitch)
         return np.array([level * math.cos(azimuth), level * math.sin(azimuth), -math.sin(pitch)])
 
-    def _explained(self, found: OutOfReach) -> str:
+    def _explain(self, found: OutOfReach) -> str:
         if found.posture is None:
             return found.reason
         text = f"not reachable: {found.reason}"

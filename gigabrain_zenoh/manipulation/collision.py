@@ -115,20 +115,20 @@ class CollisionChecker:
         for geom in spec.geoms:  # geoms with any contact bits collide with all others
             geom.contype = geom.conaffinity = int(bool(geom.contype or geom.conaffinity))
         for thing in things:
-            _add(spec, spec.worldbody, thing, thing.name, BASE_FRAME)
+            _add_thing(spec, spec.worldbody, thing, thing.name, BASE_FRAME)
         if held:
-            _add(spec, spec.site(arm.tool).parent, held, HELD, arm.tool_frame())
+            _add_thing(spec, spec.site(arm.tool).parent, held, HELD, arm.tool_frame())
         added = {HELD, *(thing.name for thing in things)}
-        self._model = _compiled(spec, [*arm.neighbours, *ignore])
+        self._model = _compile(spec, [*arm.neighbours, *ignore])
         self._data = mujoco.MjData(self._model)
         self._set = PostureSetter(self._model, arm)
         beyond = float(np.linalg.norm(np.abs(held.position) + held.half)) if held else 0.0
         self._levers = arm.levers(LINK_RADIUS_M + beyond)
-        self._names = [_name(self._model, geom, added) for geom in range(self._model.ngeom)]
+        self._names = [_geom_name(self._model, geom, added) for geom in range(self._model.ngeom)]
 
     def touches(self, posture: Floats) -> str:
         """Return the names of two that touch within the margin, as text; empty if none do."""
-        self._place(posture, self.margin)
+        self._find_contacts(posture, self.margin)
         distance, pair = self._overlap() or self._nearest(self.margin)
         return " and ".join(pair) if pair and distance < self.margin else ""
 
@@ -141,7 +141,7 @@ class CollisionChecker:
 
         It is exact up to the margin.
         """
-        self._place(posture, cutoff)
+        self._find_contacts(posture, cutoff)
         if not self._data.ncon:
             return cutoff
         room = float(self._data.contact.dist.min())
@@ -171,7 +171,7 @@ class CollisionChecker:
 
     def clearance(self, posture: Floats, cutoff: float = DISTANCE_CUTOFF_M) -> Clearance:
         """Return the smallest distance, if it is below `cutoff` [m]."""
-        self._place(posture, cutoff)
+        self._find_contacts(posture, cutoff)
         distance, pair = self._nearest(cutoff)
         return Clearance(distance=distance, pair=pair)
 
@@ -200,7 +200,7 @@ class CollisionChecker:
                 nearest, found = float(distance), (self._names[one], self._names[other])
         return nearest, found
 
-    def _place(self, posture: Floats, margin: float) -> None:
+    def _find_contacts(self, posture: Floats, margin: float) -> None:
         """Find all contacts nearer than `margin` [m]."""
         if self._model.geom_margin[0] != margin:
             self._model.geom_margin[:] = self._model.body_margin[:] = margin
@@ -210,7 +210,7 @@ class CollisionChecker:
         mujoco.mj_collision(self._model, self._data)
 
 
-def _add(
+def _add_thing(
     spec: mujoco.MjSpec, parent: mujoco.MjsBody, thing: Thing, name: str, within: Frame
 ) -> None:
     """Add a thing to `parent`; its pose is in the frame `within` of that body."""
@@ -228,7 +228,7 @@ def _add(
     body.add_geom(type=GEOMS[thing.kind], size=size, contype=1, conaffinity=1)
 
 
-def _compiled(spec: mujoco.MjSpec, apart: Sequence[tuple[str, str]]) -> mujoco.MjModel:
+def _compile(spec: mujoco.MjSpec, apart: Sequence[tuple[str, str]]) -> mujoco.MjModel:
     """Compile, with pairs of bodies that may touch. Raises ConfigError."""
     names = [body.name for body in spec.bodies]
     for pair in apart:
@@ -242,6 +242,6 @@ def _compiled(spec: mujoco.MjSpec, apart: Sequence[tuple[str, str]]) -> mujoco.M
         raise unusable(error) from None
 
 
-def _name(model: mujoco.MjModel, geom: int, added: Collection[str]) -> str:
+def _geom_name(model: mujoco.MjModel, geom: int, added: Collection[str]) -> str:
     body = str(model.body(model.geom_bodyid[geom]).name)
     return body if body in added else str(model.geom(geom).name) or body

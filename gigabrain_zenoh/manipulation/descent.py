@@ -139,7 +139,7 @@ def _goal_error(frame: Floats, goal: Floats, part: int, error: Floats) -> None:
 
 
 @kernel
-def _solved(
+def _solve(
     square: Floats, right: Floats, damping: float, held: Flags, lower: Floats, step: Floats
 ) -> None:
     """Solve (square + damping) step = right for `step` (Cholesky); joints that are held stay.
@@ -228,7 +228,7 @@ def _descend(
             held[k] = (low and slope[k] < 0.0) or (high and slope[k] > 0.0)
         new_cost, moved = math.inf, 0.0
         while damping < MAX_DAMPING:
-            _solved(square, slope, damping, held, lower, step)
+            _solve(square, slope, damping, held, lower, step)
             moved, longest = 0.0, 1e-12
             for k in range(count):
                 longest = max(longest, abs(step[k]))

@@ -104,14 +104,14 @@ class GraspPlanner:
             before, posture = grasp
             found.append(Grasp(
                 tool=tool, width=width, tilt=tilt, before=before, posture=posture,
-                opening=self._opening.position(_opened(width, self._opening)),
+                opening=self._opening.position(_open_width(width, self._opening)),
                 closed=self._opening.position(width),
                 clearance=checkers[width][1].clearance(posture).distance,
             ))  # fmt: skip
             if len(found) == enough:
                 break
         if found:
-            return self._ordered(found, thing)
+            return self._sort(found, thing)
         if not faults:
             narrowest, widest = narrowest_width(thing), self._opening.widest - 2 * GAP_M
             return NoGrasp(
@@ -121,12 +121,12 @@ class GraspPlanner:
         nearest = min(faults, key=lambda one: (one.position_error, one.orientation_error))
         return NoGrasp(reason=f"{thing.name}: {nearest.reason}")
 
-    def _ordered(self, found: Sequence[Grasp], thing: Thing) -> list[Grasp]:
+    def _sort(self, found: Sequence[Grasp], thing: Thing) -> list[Grasp]:
         sufficient = ROOM_M if narrowest_width(thing) > WIDE * self._opening.widest else math.inf
         return sorted(found, key=lambda one: (-min(one.clearance, sufficient), one.tilt))
 
     def _checker(self, things: Sequence[Thing], width: float) -> CollisionChecker:
-        opening = self._opening.position(_opened(width, self._opening))
+        opening = self._opening.position(_open_width(width, self._opening))
         return CollisionChecker(self.arm, things, margin=MARGIN_M, gripper=opening)
 
     def _grasp(
@@ -137,10 +137,10 @@ class GraspPlanner:
         at = self._inverse.solve(goal, start, checker.touches, TRIES)
         if isinstance(at, OutOfReach):
             return at
-        before = self._before(checker, tool, at.posture)
+        before = self._approach_start(checker, tool, at.posture)
         return before if isinstance(before, OutOfReach) else (before, at.posture)
 
-    def _before(
+    def _approach_start(
         self, checker: CollisionChecker, tool: Frame, posture: Floats
     ) -> Floats | OutOfReach:
         """Return a posture from which the tool can move straight to the thing."""
@@ -173,7 +173,7 @@ def candidates(thing: Thing, opening: Opening) -> Iterator[tuple[Frame, float, f
             if width + 2 * GAP_M > opening.widest or np.linalg.norm(level) < MIN_LEVEL:
                 continue  # too wide, or the fingers would close from above
             level /= np.linalg.norm(level)
-            middle = opening.middle(opening.position(_opened(width, opening)))
+            middle = opening.middle(opening.position(_open_width(width, opening)))
             for side in (1.0, -1.0) if tilt else (1.0,):
                 approach = side * math.sin(tilt) * level
                 approach = approach - math.cos(tilt) * np.cross(across, level)
@@ -184,7 +184,7 @@ def candidates(thing: Thing, opening: Opening) -> Iterator[tuple[Frame, float, f
                     yield Frame(position=place, axes=axes), width, tilt
 
 
-def _opened(width: float, opening: Opening) -> float:
+def _open_width(width: float, opening: Opening) -> float:
     """Return the distance between the pads before they close on a thing [m]."""
     return max(width + 2 * GAP_M, min(width + 2 * WIDE_GAP_M, opening.widest))
 

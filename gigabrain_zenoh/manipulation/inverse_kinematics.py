@@ -175,20 +175,20 @@ class InverseKinematics:
     def _descents(self, goal: ToolGoal, start: Floats | None, tries: int) -> Iterator[_DescentEnd]:
         """Yield the ends of all descents, a few at a time: an early one often reaches the goal."""
         if start is not None:
-            yield from self._ends(goal, np.clip(start, *self._limits)[None])
+            yield from self._descend_and_refine(goal, np.clip(start, *self._limits)[None])
         starts = self._starts(goal, tries)
         for at in range(0, len(starts), AT_ONCE):
-            yield from self._ends(goal, starts[at : at + AT_ONCE])
+            yield from self._descend_and_refine(goal, starts[at : at + AT_ONCE])
 
-    def _ends(self, goal: ToolGoal, starts: Floats) -> Iterator[_DescentEnd]:
+    def _descend_and_refine(self, goal: ToolGoal, starts: Floats) -> Iterator[_DescentEnd]:
         near = NEAR_M + ARMS_LENGTH_M * goal.orientation_tolerance
         for end in self._descend(goal, starts, FIRST_STEPS):
-            yield self._refined(goal, end) if end.cost < near else end
+            yield self._refine(goal, end) if end.cost < near else end
 
     def _nearest(self, goal: ToolGoal, found: Sequence[_DescentEnd]) -> _DescentEnd:
         """Return the nearest posture to an unreachable goal; the position comes first."""
         best = sorted(found, key=lambda one: one.cost)[:NEAREST]
-        refined = [self._refined(goal, one) for one in best]
+        refined = [self._refine(goal, one) for one in best]
         if goal.part != PLACE:
             starts = self._starts(ToolGoal(position=goal.position), NEAREST)[:NEAREST]
             refined += self._descend(goal, starts, STEPS, FIRST_M)
@@ -206,7 +206,7 @@ class InverseKinematics:
         nearest = nearest[np.argsort(off[nearest], kind="stable")]
         return np.concatenate((self._table[nearest], self._table[: tries - near]))
 
-    def _refined(self, goal: ToolGoal, found: _DescentEnd) -> _DescentEnd:
+    def _refine(self, goal: ToolGoal, found: _DescentEnd) -> _DescentEnd:
         """Descend to the end; if the orientation pulls the tool away, lower its weight."""
         for weight in (FIRST_M, 0.0):
             if found.position_error >= POSITION_TOLERANCE_M:

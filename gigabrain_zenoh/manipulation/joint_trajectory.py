@@ -107,7 +107,7 @@ class TimeParametrization:
             for corner in bad:  # pass both ends of a part more slowly
                 shares[corner] = min(shares[corner] + 1, len(SPEEDS) - 1)
         stops, _ = self._parts(postures, [start, *(rest for _ in speeds[1:])], checker)
-        return self._sampled(postures[0], min(parts, stops, key=_duration))
+        return self._sample(postures[0], min(parts, stops, key=_duration))
 
     def _corner_speeds(self, postures: Floats) -> list[Floats]:
         """Return the velocity (n,) at each posture: 0 at the ends, and where a joint turns back."""
@@ -133,7 +133,7 @@ class TimeParametrization:
             parts.append(part)
             corners = [c for c in (k, k + 1) if 0 < c < len(postures) - 1 and np.any(states[c])]
             moving = k == 0 and bool(np.any(states[0]))  # it may have to turn round first
-            strays = not moving and _strays(part, postures[k : k + 2])
+            strays = not moving and _leaves_box(part, postures[k : k + 2])
             if (corners or moving) and (strays or not self._is_clear(part, checker)):
                 if not corners:
                     raise Refused("the arm moves too fast to turn into the path without a contact")
@@ -167,7 +167,7 @@ class TimeParametrization:
         postures = [np.array(part.at_time(time)[0]) for time in times]
         return all(checker.is_line_free(a, b, MARGIN_SHARE) for a, b in pairwise(postures))
 
-    def _sampled(self, start: Floats, parts: Sequence[ruckig.Trajectory]) -> JointTrajectory:
+    def _sample(self, start: Floats, parts: Sequence[ruckig.Trajectory]) -> JointTrajectory:
         rest = np.zeros(len(start))
         ends = np.cumsum([0.0, *(part.duration for part in parts)])
         times = np.append(np.arange(0.0, ends[-1], self.period), ends[-1])
@@ -187,7 +187,7 @@ def _duration(parts: Sequence[ruckig.Trajectory]) -> float:
     return float(sum(part.duration for part in parts))
 
 
-def _strays(part: ruckig.Trajectory, ends: Floats) -> bool:
+def _leaves_box(part: ruckig.Trajectory, ends: Floats) -> bool:
     """Return whether a part leaves the box in joint space between its `ends` (2, n)."""
     tolerance = MAX_STRAY * np.abs(ends[1] - ends[0]).max()
     low, high = ends.min(axis=0) - tolerance, ends.max(axis=0) + tolerance

@@ -135,7 +135,7 @@ class PickPlacePlanner:
             self.arm, others, held=held, margin=0.001, ignore=may_touch(held, others)
         )
         faults = []
-        for tool in self._tools_at(held, target, posture):
+        for tool in self._place_poses(held, target, posture):
             one = self._place(checker, tool, held, others, posture, opening)
             if isinstance(one, Place):
                 return one
@@ -149,21 +149,21 @@ class PickPlacePlanner:
         way = plan(around, posture, grasp.before)
         if isinstance(way, NoPath):
             return NoWay(reason=f"{thing.name}: {way.reason}")
-        held = self._held(thing, grasp)
+        held = self._held_thing(thing, grasp)
         lifting = CollisionChecker(
             self.arm, others, held=held, margin=0.001, ignore=may_touch(held, others)
         )
-        up = self._lifted(lifting, grasp)
+        up = self._lift_postures(lifting, grasp)
         phases = (
             Phase(name="open", gripper=grasp.opening),
             Phase(name="hover", arm=self._fast.trajectory(way.postures, checker=around)),
             Phase(name="descend", arm=self._straight(grasp.before, grasp.posture)),
-            Phase(name="close", gripper=self._squeezed(grasp)),
+            Phase(name="close", gripper=self._squeeze_position(grasp)),
             Phase(name="lift", arm=self._slow.trajectory(up)),
         )
         return Pick(grasp=grasp, phases=phases, held=held)
 
-    def _lifted(self, checker: CollisionChecker, grasp: Grasp) -> Floats:
+    def _lift_postures(self, checker: CollisionChecker, grasp: Grasp) -> Floats:
         """Return postures (k, n) from the grasp straight up, or else back along the approach."""
         here = self.arm.forward(grasp.posture)
         raised = here.position + np.array([0.0, 0.0, LIFT_M])
@@ -211,7 +211,7 @@ class PickPlacePlanner:
         self, tool: Frame, down: Reachable, held: Thing, others: Sequence[Thing], opening: float
     ) -> JointTrajectory:
         """Return the way back along the approach from a released thing, as far as possible."""
-        left = _at(self.arm.forward(down.posture), held)
+        left = _in_base_frame(self.arm.forward(down.posture), held)
         beside = [(left.name, body) for body in self.arm.hand]  # a finger rests against it
         checker = CollisionChecker(
             self.arm, [left, *others], margin=0.0, ignore=beside, gripper=opening
@@ -224,10 +224,10 @@ class PickPlacePlanner:
                 return self._straight(down.posture, away.posture)
         return self._straight(down.posture, down.posture)
 
-    def _tools_at(self, held: Thing, target: Floats, posture: Floats) -> list[Frame]:
+    def _place_poses(self, held: Thing, target: Floats, posture: Floats) -> list[Frame]:
         """Return poses of the tool with the held thing at its target, the smallest turn first."""
         now = self.arm.forward(posture)
-        thing = _at(now, held)
+        thing = _in_base_frame(now, held)
         raised = target + np.array([0.0, 0.0, PLACE_GAP_M])
         found = []
         for number in range(PLACE_YAWS):
@@ -241,7 +241,7 @@ class PickPlacePlanner:
     def _straight(self, start: Floats, goal: Floats) -> JointTrajectory:
         return self._creep.trajectory(np.stack((start, goal)))
 
-    def _held(self, thing: Thing, grasp: Grasp) -> Thing:
+    def _held_thing(self, thing: Thing, grasp: Grasp) -> Thing:
         """Return a thing in the frame of the tool, after the fingers have closed on it.
 
         A single moving finger pushes the thing to the other one.
@@ -251,7 +251,7 @@ class PickPlacePlanner:
         place[2] = self._opening.middle(grasp.closed)
         return replace(thing, position=place, axes=tool.axes.T @ thing.axes)
 
-    def _squeezed(self, grasp: Grasp) -> float:
+    def _squeeze_position(self, grasp: Grasp) -> float:
         """Return the goal of the gripper's joint to hold a thing: beyond its width."""
         closing = math.copysign(1.0, grasp.closed - grasp.opening)
         span = self._gripper.upper - self._gripper.lower
@@ -264,7 +264,7 @@ def may_touch(held: Thing, others: Sequence[Thing]) -> list[tuple[str, str]]:
     return [("held", other.name) for other in others if other.kind == "floor"]
 
 
-def _at(tool: Frame, held: Thing) -> Thing:
+def _in_base_frame(tool: Frame, held: Thing) -> Thing:
     """Return a held thing in the frame of the base."""
     return replace(held, position=tool.place(held.position), axes=tool.axes @ held.axes)
 

@@ -100,10 +100,10 @@ def plan(
         begin = free_start
     way = [begin, goal]
     if not checker.is_line_free(begin, goal):
-        found = _connect(checker, begin, goal, random, until)
+        found = _connect_trees(checker, begin, goal, random, until)
         if found is None:
             return NoPath(cause="time", reason=f"no way round was found within {time_limit:g} s")
-        way = _shortened(checker, found, random)
+        way = _shorten(checker, found, random)
     return JointPath(postures=np.array(way if begin is start else [start, *way]))
 
 
@@ -124,7 +124,7 @@ def _escape(checker: CollisionChecker, start: Floats, random: np.random.Generato
     return None
 
 
-def _connect(
+def _connect_trees(
     checker: CollisionChecker,
     start: Floats,
     goal: Floats,
@@ -162,7 +162,7 @@ def _extend(checker: CollisionChecker, tree: Tree, number: int, aim: Floats) -> 
     return -1, False
 
 
-def _shortened(
+def _shorten(
     checker: CollisionChecker, way: list[Floats], random: np.random.Generator
 ) -> list[Floats]:
     """Replace parts of a way by straight lines."""
@@ -172,7 +172,7 @@ def _shortened(
             break
         lengths = np.array([float(np.linalg.norm(b - a)) for a, b in pairwise(way)])
         ends = np.sort(random.uniform(0.0, lengths.sum(), 2))
-        (i, first), (k, second) = (_along(way, lengths, end) for end in ends)
+        (i, first), (k, second) = (_point_along(way, lengths, end) for end in ends)
         if i != k and checker.is_line_free(first, second):
             way = [*way[: i + 1], first, second, *way[k + 1 :]]
     return _without_detours(checker, way)
@@ -188,7 +188,7 @@ def _without_detours(checker: CollisionChecker, way: list[Floats]) -> list[Float
     return kept
 
 
-def _along(way: list[Floats], lengths: Floats, length: float) -> tuple[int, Floats]:
+def _point_along(way: list[Floats], lengths: Floats, length: float) -> tuple[int, Floats]:
     """Return the part of a way at `length` from its start, and the posture there."""
     ends = np.cumsum(lengths)
     part = min(int(np.searchsorted(ends, length)), len(lengths) - 1)

@@ -80,13 +80,13 @@ class PressPlanner:
         around = CollisionChecker(self.arm, solids, margin=MARGIN_M, gripper=self._closed)
         touched = [(thing.name, body) for body in self.arm.hand] if thing else []
         along = CollisionChecker(
-            self.arm, [_raised(one) for one in solids], margin=MARGIN_M, gripper=self._closed,
+            self.arm, [_with_margin(one) for one in solids], margin=MARGIN_M, gripper=self._closed,
             ignore=touched,
         )  # fmt: skip
         fault = NoWay(reason="not reachable")
         for number, approach in enumerate(approaches):
             point = target if not isinstance(target, Thing) else near_side(target, approach)
-            line = self._line(along, point, approach, depth, posture)
+            line = self._press_line(along, point, approach, depth, posture)
             if isinstance(line, NoWay):
                 fault = fault if number else line  # the fault of the best approach
                 continue
@@ -109,9 +109,9 @@ class PressPlanner:
         """Plan to keep the posture of a press for some `seconds`, and then to go back."""
         away = self._creep.trajectory(np.stack((posture, before)))
         retreat = Phase(name="retreat", arm=away)
-        return (Phase(name="hold", arm=self._still(posture, seconds)), retreat)
+        return (Phase(name="hold", arm=self._stay(posture, seconds)), retreat)
 
-    def _line(
+    def _press_line(
         self,
         checker: CollisionChecker,
         point: Floats,
@@ -142,7 +142,7 @@ class PressPlanner:
             break
         return np.array(found)
 
-    def _still(self, posture: Floats, seconds: float) -> JointTrajectory:
+    def _stay(self, posture: Floats, seconds: float) -> JointTrajectory:
         rest = np.zeros((2, len(posture)))
         return JointTrajectory(
             names=self.arm.names, times=np.array([0.0, seconds]),
@@ -162,7 +162,7 @@ def near_side(thing: Thing, approach: Floats) -> Floats:
     return np.asarray(thing.position - way * approach)
 
 
-def _raised(thing: Thing) -> Thing:
+def _with_margin(thing: Thing) -> Thing:
     if thing.kind != "floor":
         return thing
     return replace(thing, position=thing.position + np.array([0.0, 0.0, FLOOR_M]))

@@ -301,12 +301,12 @@ async def measure_hops(monitor: ChainMonitor, total: Latencies) -> list[Hop]:
     ):
         for topic in HOPS:  # without a subscriber, no message is sent
             receiver.subscribe(topic, lambda _key, _message: None)
-        await _take_turns(monitor, sender, timer)
+        await _time_turns(monitor, sender, timer)
     await _time_bridge(timer)
     return [_hop(monitor, total, timer, topic) for topic in HOPS]
 
 
-async def _take_turns(monitor: ChainMonitor, bus: Bus, timer: HopTimer) -> None:
+async def _time_turns(monitor: ChainMonitor, bus: Bus, timer: HopTimer) -> None:
     """Time the work of all nodes for one scan, in each turn."""
     first, loop = monitor.get(STATE).tick, DecisionLoop(DecisionConfig())
     payloads = {topic.key: codec.encode(monitor.get(topic)) for topic in HOPS}
@@ -361,7 +361,7 @@ def _hop(monitor: ChainMonitor, total: Latencies, timer: HopTimer, topic: Topic[
         monitor.between(topic, after) if after else total.p50_ms - monitor.between(HOPS[0], topic)
     )
     return Hop(
-        name=f"{_short(topic)} → {_short(after) if after else 'driver'}",
+        name=f"{_short_name(topic)} → {_short_name(after) if after else 'driver'}",
         took=took,
         put=timer.median(f"put {topic.key}"),
         bridge=timer.median("bridge"),
@@ -370,7 +370,7 @@ def _hop(monitor: ChainMonitor, total: Latencies, timer: HopTimer, topic: Topic[
     )
 
 
-def _short(topic: Topic[Any]) -> str:
+def _short_name(topic: Topic[Any]) -> str:
     return topic.key.rpartition("/")[2]
 
 

@@ -287,7 +287,7 @@ class CourseDriver:
                 reason = over or await self._go(goal.x, goal.y)
             except Over as end:
                 reason = over = str(end)
-            off = await self._off(x, y)
+            off = await self._distance_to(x, y)
             if not reason and off > REACHED_M:
                 reason = f"reported as reached, {off:.2f} m from the goal"
             if not reason:
@@ -348,22 +348,22 @@ class CourseDriver:
                 polls += 1
                 if polls % POLLS_PER_LOOK == 0:
                     await self.look()
-                self._check()
+                self._raise_if_over()
             return await waiting
         finally:
             waiting.cancel()
 
-    def _check(self) -> None:
+    def _raise_if_over(self) -> None:
         if self._truth.get("falls"):
             raise Over("it has fallen")
         if self.seconds > self._longest_s:
-            raise Over(f"{self._longest_s:g} s are over: {self._doing()}")
+            raise Over(f"{self._longest_s:g} s are over: {self._current_activity()}")
         state = self._states.current
         latching = [cause.text for cause in state.gate.causes if cause.latching] if state else []
         if state and state.gate.mode == "latched" and latching:
             raise Over(f"it has latched: {', '.join(latching)}")
 
-    def _doing(self) -> str:
+    def _current_activity(self) -> str:
         newest = self.tasks.newest
         return newest.current.reason if newest and newest.current else "no task"
 
@@ -375,7 +375,7 @@ class CourseDriver:
         truth = self._truth
         return Pose(x=truth["true_x"], y=truth["true_y"], yaw=truth["true_yaw"])
 
-    async def _off(self, x: float, y: float) -> float:
+    async def _distance_to(self, x: float, y: float) -> float:
         await self.look()
         here = self._true_pose()
         return math.hypot(here.x - x, here.y - y)

@@ -120,10 +120,10 @@ def _fits(outline: Floats, others: Sequence[Floats], start: Pose) -> bool:
         return False
     if distance(outline, np.array([[start.x, start.y]]))[0] < START_M:
         return False
-    rim = _along(outline)
+    rim = _points_along(outline)
     return all(
         _boxes_gap(outline, other) >= GAP_M
-        or min(distance(other, rim).min(), distance(outline, _along(other)).min()) >= GAP_M
+        or min(distance(other, rim).min(), distance(outline, _points_along(other)).min()) >= GAP_M
         for other in others
     )
 
@@ -134,7 +134,7 @@ def _boxes_gap(one: Floats, other: Floats) -> float:
     return float(beyond.max())
 
 
-def _along(outline: Floats) -> Floats:
+def _points_along(outline: Floats) -> Floats:
     """Return points (n, 2) [m] along an outline, closer than half of GAP_M."""
     steps = math.ceil(4 * HALF_M / GAP_M)
     share = np.linspace(0.0, 1.0, steps, endpoint=False)[:, None, None]

@@ -144,18 +144,19 @@ def measure_eyes(
             cpu: list[float] = []
             scores = ClutterScores()
             for number in range(seed, seed + worlds):
-                _clutter(Eyes(body, errors, number, cpu), draw_world(number), scores)
+                _judge_clutter(Eyes(body, errors, number, cpu), draw_world(number), scores)
             show(f"{body.robot_type}, {name}: empty floors")
             empty = _empty_floors(body, errors, seconds, seed)
             show(f"{body.robot_type}, {name}: {ghosts} ghosts")
             times = [
-                _ghost(Eyes(body, errors, number), number) for number in range(seed, seed + ghosts)
+                _ghost_duration(Eyes(body, errors, number), number)
+                for number in range(seed, seed + ghosts)
             ]
-            figures.append(_summed(body, name, scores, empty, times, cpu, worlds))
+            figures.append(_figures(body, name, scores, empty, times, cpu, worlds))
     return EyesResult(seed=seed, figures=tuple(figures))
 
 
-def _summed(
+def _figures(
     body: BodyDescription,
     sensor: str,
     scores: ClutterScores,
@@ -195,7 +196,7 @@ def _percentile(values: Sequence[float], share: float) -> float:
     return round(percentile(sorted(values), share) or 0.0, 4)
 
 
-def _driven(picture: int, turn: float = TURN) -> Pose:
+def _pose_on_arc(picture: int, turn: float = TURN) -> Pose:
     """Return the robot's pose at a picture's number, on an arc from the origin."""
     yaw = turn * picture * PERIOD_S
     if not turn:
@@ -203,17 +204,17 @@ def _driven(picture: int, turn: float = TURN) -> Pose:
     return Pose(x=SPEED / turn * math.sin(yaw), y=SPEED / turn * (1 - math.cos(yaw)), yaw=yaw)
 
 
-def _clutter(eyes: Eyes, world: EyesWorld, scores: ClutterScores) -> None:
+def _judge_clutter(eyes: Eyes, world: EyesWorld, scores: ClutterScores) -> None:
     """Drive in a cluttered world, and judge the contours after the last picture."""
     turn = TURN if eyes.seed % 2 else -TURN
     with Renderer(world, eyes.camera) as renderer:
         for number in range(PICTURES):
-            pose = _driven(number, turn)
+            pose = _pose_on_arc(number, turn)
             contours = eyes.see(renderer, pose, number * PERIOD_S)
             if number == 0:
-                scores.found_first += _found(_Truth(eyes, renderer, world, pose), contours)
+                scores.found_first += _found_things(_Truth(eyes, renderer, world, pose), contours)
         truth = _Truth(eyes, renderer, world, pose)
-    scores.found += _found(truth, contours)
+    scores.found += _found_things(truth, contours)
     _judge_outlines(truth, contours, scores)
 
 
@@ -254,7 +255,7 @@ def _outlines(pose: Pose, contours: Sequence[Contour], *, holes: bool) -> list[F
     ]
 
 
-def _found(truth: _Truth, contours: Sequence[Contour]) -> list[bool]:
+def _found_things(truth: _Truth, contours: Sequence[Contour]) -> list[bool]:
     """Return for each visible, near and large enough thing whether contours cover it."""
     outlines = _outlines(truth.pose, contours, holes=False)
     found = []
@@ -285,7 +286,7 @@ def _judge_outlines(truth: _Truth, contours: Sequence[Contour], scores: ClutterS
     here = np.array((truth.pose.x, truth.pose.y))
     outlines = _outlines(truth.pose, contours, holes=False)
     for outline in outlines:
-        samples = _along(outline)
+        samples = _points_along(outline)
         samples = samples[np.hypot(*(samples - here).T) < ERROR_REACH_M]
         off = distances(solids, samples)
         scores.wrong += bool(len(off) and off.min() > FALSE_M)
@@ -293,9 +294,9 @@ def _judge_outlines(truth: _Truth, contours: Sequence[Contour], scores: ClutterS
     reach = truth.points[truth.away < ERROR_REACH_M]
     cells = np.unique(np.round(reach[:, :2] / STEP_M), axis=0) * STEP_M
     scores.missed += np.minimum(distances(outlines, cells), 1.0).tolist()
-    scores.front += np.minimum(_to_edges(outlines, _foremost(truth)), 1.0).tolist()
+    scores.front += np.minimum(_edge_distances(outlines, _nearest_points(truth)), 1.0).tolist()
     holes = _outlines(truth.pose, contours, holes=True)
-    off_pit = [distances([pit.outline] if pit else [], _along(one)) for one in holes]
+    off_pit = [distances([pit.outline] if pit else [], _points_along(one)) for one in holes]
     scores.wrong += sum(bool(off.min() > 3 * FALSE_M) for off in off_pit)
     if pit and len(truth.pit):
         edge = np.linspace(-1, 1, 21)[:, None] * (0.0, pit.half_y) + (pit.x - pit.half_x, pit.y)
@@ -308,7 +309,7 @@ def _judge_outlines(truth: _Truth, contours: Sequence[Contour], scores: ClutterS
         scores.pit += np.concatenate([*off_pit, np.empty(0)]).tolist()
 
 
-def _foremost(truth: _Truth) -> Floats:
+def _nearest_points(truth: _Truth) -> Floats:
     """Return the nearest point along each line of sight (n, 2), in steps of BEARING_STEP."""
     reach = truth.away < ERROR_REACH_M
     points, away = truth.points[reach, :2], truth.away[reach]
@@ -318,16 +319,16 @@ def _foremost(truth: _Truth) -> Floats:
     return points[order[np.flatnonzero(np.diff(step[order], prepend=-9999))]]
 
 
-def _to_edges(outlines: Sequence[Floats], points: Floats) -> Floats:
+def _edge_distances(outlines: Sequence[Floats], points: Floats) -> Floats:
     """Return the distance of each point (n, 2) to the nearest edge [m], inside as well."""
     if not outlines or not len(points):
         return np.full(len(points), np.inf)
-    samples = np.concatenate([_along(one, EDGE_STEP_M) for one in outlines])
+    samples = np.concatenate([_points_along(one, EDGE_STEP_M) for one in outlines])
     off = points[:, None] - samples
     return np.asarray(np.hypot(off[..., 0], off[..., 1]).min(axis=1))
 
 
-def _along(outline: Floats, step: float = STEP_M) -> Floats:
+def _points_along(outline: Floats, step: float = STEP_M) -> Floats:
     """Return points along an outline (n, 2), at most `step` [m] apart."""
     parts = []
     for begin, end in zip(outline, np.roll(outline, -1, axis=0), strict=True):
@@ -357,7 +358,7 @@ def _empty_floors(
         coloured: set[int] = set()
         with Renderer(EyesWorld(texture=texture, light=light), eyes.camera) as renderer:
             for picture in range(count):
-                pose = _driven(picture, 0.3 if picture % 100 < 50 else -0.3)
+                pose = _pose_on_arc(picture, 0.3 if picture % 100 < 50 else -0.3)
                 now = picture * PERIOD_S
                 found |= {one.track for one in eyes.see(renderer, pose, now)}
                 by_colour.add_colour(eyes.camera.name, renderer.colour(), pose, now)
@@ -366,7 +367,7 @@ def _empty_floors(
     return EmptyFloors(depth, colour, count * len(TEXTURES) * len(LIGHTS))
 
 
-def _ghost(eyes: Eyes, seed: int) -> float:
+def _ghost_duration(eyes: Eyes, seed: int) -> float:
     """Return how long a removed thing's contour stays after its place is seen empty [s]."""
     random = np.random.default_rng(np.random.SeedSequence((seed, 19)))
     kind = GHOST_KINDS[seed % len(GHOST_KINDS)]
@@ -380,7 +381,7 @@ def _ghost(eyes: Eyes, seed: int) -> float:
     with Renderer(EyesWorld((thing,), backdrop=behind), eyes.camera) as renderer:
         for now, pose, at, counts in _ghost_story(kind, looks_away):
             found = eyes.see(renderer, pose, now, at)
-            if counts is not None and not _haunted(pose, found, thing.outline, at):
+            if counts is not None and not _has_ghost(pose, found, thing.outline, at):
                 return counts
     return GHOST_WAIT_S
 
@@ -407,13 +408,13 @@ def _ghost_story(
         yield (begin + number) * PERIOD_S, ORIGIN, at, number * PERIOD_S
 
 
-def _haunted(
+def _has_ghost(
     pose: Pose, contours: Sequence[Contour], stood: Floats, moved: tuple[float, float]
 ) -> bool:
     """Return whether a contour covers the thing's old place, and not only its new one."""
     now = stood + moved
     for outline in _outlines(pose, contours, holes=False):
-        samples = _along(outline)
+        samples = _points_along(outline)
         if distances([stood], samples).min() < GHOST_M and distances([now], samples).max() > 0.1:
             return True
     return False

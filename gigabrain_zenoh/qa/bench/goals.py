@@ -281,7 +281,7 @@ class GoalSender:
     async def explore(self) -> str:
         """Explore from the origin of the map; return the end state and its reason."""
         truth = await self._true_pose()
-        self._world_from_map = compose(truth, inverse(self._here()))
+        self._world_from_map = compose(truth, inverse(self._estimated_pose()))
         task = await self._tasks.explore()
         self.accepted_s = asyncio.get_running_loop().time()
         ended = await self._while_running(self._tasks.result(task))
@@ -290,15 +290,15 @@ class GoalSender:
     async def send(self) -> None:
         """Send the robot to a random goal, and wait for the result."""
         # retry: a person who blocks all ways walks on after a while
-        goal = await self._retried(GigabrainError, self.random_goal)
+        goal = await self._retry(GigabrainError, self.random_goal)
         self.sent += 1
         reason = await self._go(goal)
         if not reason:
-            off = await self._off(goal)
+            off = await self._error_at(goal)
             self.off.append(off)
             reason = missed_by(off)
         if reason:
-            seconds, here = round(self.seconds, 2), self._here()
+            seconds, here = round(self.seconds, 2), self._estimated_pose()
             self.failures.append(GoalFailure(goal=goal, at=here, seconds=seconds, reason=reason))
         else:
             self.reached += 1
@@ -340,9 +340,9 @@ class GoalSender:
 
     async def _send_goal(self, goal: Goal) -> str:
         """Send a goal and return the task's name; repeat while a busy host does not answer."""
-        return await self._retried(BodyLost, lambda: self._tasks.go_to(goal.x, goal.y, goal.yaw))
+        return await self._retry(BodyLost, lambda: self._tasks.go_to(goal.x, goal.y, goal.yaw))
 
-    async def _retried(self, error: type[GigabrainError], work: Callable[[], Awaitable[T]]) -> T:
+    async def _retry(self, error: type[GigabrainError], work: Callable[[], Awaitable[T]]) -> T:
         """Repeat `work` for up to a minute while it raises `error`."""
         loop = asyncio.get_running_loop()
         end_s = loop.time() + MAX_SILENCE_S
@@ -354,7 +354,7 @@ class GoalSender:
                     raise
             await self._group.poll()
 
-    async def _off(self, goal: Goal) -> GoalError:
+    async def _error_at(self, goal: Goal) -> GoalError:
         assert self._world_from_map
         target = compose(self._world_from_map, Pose(x=goal.x, y=goal.y, yaw=goal.yaw or 0.0))
         truth = await self._true_pose()
@@ -365,7 +365,7 @@ class GoalSender:
         truth = await self.report()
         return Pose(x=truth["true_x"], y=truth["true_y"], yaw=truth["true_yaw"])
 
-    def _here(self) -> Pose:
+    def _estimated_pose(self) -> Pose:
         pose = self._poses.current
         assert pose
         return Pose(x=pose.x, y=pose.y, yaw=pose.yaw)
@@ -391,7 +391,7 @@ class GoalSender:
 
     async def _random_place(self) -> Point:
         """Return a reachable place in the map where the body can turn."""
-        grid, body, here = self._maps.current, self._bodies.current, self._here()
+        grid, body, here = self._maps.current, self._bodies.current, self._estimated_pose()
         assert grid
         assert body
         costs = costmap(grid, inflation(body.description, "forbid"))
@@ -414,13 +414,13 @@ class GoalSender:
         try:
             while not waiting.done():
                 await self._group.poll()
-                self._refuse_latched()
+                self._raise_if_latched()
                 self._sample()
             return await waiting
         finally:
             waiting.cancel()
 
-    def _refuse_latched(self) -> None:
+    def _raise_if_latched(self) -> None:
         """Raise GigabrainError if only a person can make the robot drive again."""
         state = self._states.current
         latching = [cause.text for cause in state.gate.causes if cause.latching] if state else []

@@ -202,7 +202,7 @@ class ArmInMemory:
         for _ in range(2):
             self.simulation.advance()
         self.ticks += 1
-        self.broken += self._breaks()
+        self.broken += self._breaks_limits()
 
     def carry_out(self, phase: Phase) -> None:
         """Execute one phase of a plan."""
@@ -240,7 +240,7 @@ class ArmInMemory:
     def _feed(self, event: gate.Event) -> None:
         self._gate, _ = gate.step(self._gate_config, self._gate, event)
 
-    def _breaks(self) -> bool:
+    def _breaks_limits(self) -> bool:
         """Return whether a joint is truly beyond its range; record the highest speed."""
         for joint, position, speed in zip(self.description.joints, *self.arm.truth(), strict=True):
             slack = SLACK * (joint.upper - joint.lower)
@@ -331,7 +331,7 @@ def _run(seed: int, robot: RobotFile, model: SimModel) -> HandsRun:
         from gigabrain_zenoh.qa.bench.hands_camera import ArmCamera  # imports OpenCV
 
         with closing(ArmCamera(arm.description, model.model, arm.simulation, seed)) as camera:
-            look = partial(_seen, arm, planner, camera)
+            look = partial(_find_thing, arm, planner, camera)
             _pick_and_place(arm, planner, look, drawn, rng, attempt)
     else:
         _pick_and_place(arm, planner, drawn.thing, drawn, rng, attempt)
@@ -348,7 +348,7 @@ def _run(seed: int, robot: RobotFile, model: SimModel) -> HandsRun:
     )  # fmt: skip
 
 
-def _seen(arm: ArmInMemory, planner: ArmPlanner, camera: "ArmCamera") -> Thing | None:
+def _find_thing(arm: ArmInMemory, planner: ArmPlanner, camera: "ArmCamera") -> Thing | None:
     """Return the nearest thing that the camera sees; the arm moves out of its view."""
     lookout = Lookout()
     while not (seen := camera.look(arm.state())):
@@ -372,7 +372,7 @@ def _pick_and_place(
 ) -> None:
     """Pick the thing up and put it down at a reachable place; fill in the attempt."""
     names = planner.arm.names
-    hold = _picked(arm, planner, look, drawn, attempt)
+    hold = _pick(arm, planner, look, drawn, attempt)
     if hold is None:
         return
     if arm.thing()[2] < drawn.height + LIFTED_M:
@@ -390,7 +390,7 @@ def _pick_and_place(
     return None
 
 
-def _picked(
+def _pick(
     arm: ArmInMemory,
     planner: ArmPlanner,
     look: Callable[[], Thing | None],
@@ -410,7 +410,7 @@ def _picked(
         if isinstance(pick, NoWay):
             attempt.end("not gripped" if misses else "unreachable", pick.reason)
             return None
-        hold = _gripped(arm, planner, pick, thing)
+        hold = _execute_pick(arm, planner, pick, thing)
         if hold:
             return hold
         back = planner.back_off(pick, arm.posture(planner.arm.names))
@@ -419,7 +419,7 @@ def _picked(
     return None
 
 
-def _gripped(arm: ArmInMemory, planner: ArmPlanner, pick: Plan, thing: Thing) -> Hold | None:
+def _execute_pick(arm: ArmInMemory, planner: ArmPlanner, pick: Plan, thing: Thing) -> Hold | None:
     """Execute a pick; return the hold, or None as soon as the gripper is empty."""
     assert pick.hold
     assert planner.arm.gripper
@@ -429,17 +429,17 @@ def _gripped(arm: ArmInMemory, planner: ArmPlanner, pick: Plan, thing: Thing) ->
         if phase.name == "close":
             posture = np.array([arm.measured(name) for name in planner.arm.names])
             hold = planner.gripped(hold, thing, posture)
-            hold = _squeezed(arm, planner, hold, gripper)
+            hold = _adjust_grip(arm, planner, hold, gripper)
         if phase.name == "lift":
             place = planner.squeeze(arm.measured(gripper), hold.grip, moving=False)
             arm.carry_out(Phase(name="grip", gripper=place))
-            hold = _squeezed(arm, planner, dataclasses.replace(hold, grip=place), gripper)
+            hold = _adjust_grip(arm, planner, dataclasses.replace(hold, grip=place), gripper)
         if phase.name in {"close", "lift"} and not planner.holds(arm.measured(gripper), hold.grip):
             return None
     return hold
 
 
-def _squeezed(arm: ArmInMemory, planner: ArmPlanner, hold: Hold, gripper: str) -> Hold:
+def _adjust_grip(arm: ArmInMemory, planner: ArmPlanner, hold: Hold, gripper: str) -> Hold:
     """Adjust the gripper's force for a moving arm, like decision."""
     while True:
         place = planner.squeeze(arm.measured(gripper), hold.grip, moving=True)

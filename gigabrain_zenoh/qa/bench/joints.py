@@ -142,7 +142,7 @@ class Trial:
         wanted, measured = self._sine(low)
         error_deg = np.degrees(measured - wanted)
         self._go_to(low)
-        step = np.array(list(self._stepped(high)))
+        step = np.array(list(self._step_response(high)))
         return JointTracking(
             joint=self._name,
             amplitude_deg=math.degrees(self._swing),
@@ -153,25 +153,25 @@ class Trial:
             rest_deg=math.degrees(abs(float(step[-1]) - high)),
         )
 
-    def _truth(self) -> float:
+    def _true_position(self) -> float:
         places = dict(zip(self._arm.arm.names, self._arm.arm.truth()[0], strict=True))
         return places[self._name]
 
     def _go_to(self, place: float) -> None:
         """Bring the arm to rest in its posture, with the joint at `place` [rad]."""
-        wanted = self._postured(place)
+        wanted = self._posture_with(place)
         before = self._arm.posture(self._kinematics.names)
         for share in np.linspace(0.0, 1.0, SETTLE_TICKS):
-            self._step_to(self._named(before + share * (wanted - before)))
+            self._step_to(self._by_name(before + share * (wanted - before)))
         for _ in range(SETTLE_TICKS):
-            self._step_to(self._named(wanted))
+            self._step_to(self._by_name(wanted))
 
-    def _stepped(self, place: float) -> Iterator[float]:
+    def _step_response(self, place: float) -> Iterator[float]:
         """Yield the joint's true position [rad] while it steps to `place` at full speed."""
-        wanted = self._named(self._postured(place))
+        wanted = self._by_name(self._posture_with(place))
         for _ in range(SETTLE_TICKS):
             self._step_to(wanted)
-            yield self._truth()
+            yield self._true_position()
 
     def _sine(self, low: float) -> tuple[Floats, Floats]:
         """Return the wanted and the true positions [rad], in the periods that count."""
@@ -185,17 +185,17 @@ class Trial:
                 name=(self._name,), start=first + tick, period=TICK_S,
                 positions=way[tick : tick + WINDOW_TICKS].astype("<f4").tobytes(),
             )  # fmt: skip
-            measured.append(self._truth())
+            measured.append(self._true_position())
             self._arm.step(Intent(joint_trajectory=window, behaviour="sine", reason="sine"))
         counted = slice(SKIPPED * period, PERIODS * period)
         return way[counted], np.array(measured)[counted]
 
-    def _postured(self, place: float) -> Floats:
+    def _posture_with(self, place: float) -> Floats:
         posture = self._posture.copy()
         posture[self._number] = place
         return posture
 
-    def _named(self, posture: Floats) -> Mapping[str, float]:
+    def _by_name(self, posture: Floats) -> Mapping[str, float]:
         return dict(zip(self._kinematics.names, posture.tolist(), strict=True))
 
     def _step_to(self, places: Mapping[str, float]) -> None:

@@ -142,17 +142,17 @@ def draw(seed: int) -> tuple[tuple[Placed, ...], ClutteredWorld]:
         look = maker[int(random.integers(len(maker)))](random, 0)
         x, y = random.uniform(-HALF_M + 0.5, HALF_M - 0.5, 2).tolist()
         free = math.hypot(x, y) > START_GAP_M + look.radius
-        if free and _away(x, y, placed) > GAP_M + look.radius:
+        if free and _nearest_distance(x, y, placed) > GAP_M + look.radius:
             placed.append(Placed(look, x, y, float(random.uniform(-math.pi, math.pi))))
     goals: list[Point] = []
     while len(goals) < GOALS:
         x, y = random.uniform(-HALF_M + 0.5, HALF_M - 0.5, 2).tolist()
-        if _away(x, y, placed) > GOAL_GAP_M:
+        if _nearest_distance(x, y, placed) > GOAL_GAP_M:
             goals.append((x, y))
     return tuple(placed), ClutteredWorld(seed, (), (), (), start, tuple(goals), ())
 
 
-def _away(x: float, y: float, placed: Sequence[Placed]) -> float:
+def _nearest_distance(x: float, y: float, placed: Sequence[Placed]) -> float:
     """Return the distance from a point to the nearest thing [m]."""
     away = [math.hypot(x - one.x, y - one.y) - one.look.radius for one in placed]
     return min(away, default=math.inf)

@@ -154,7 +154,7 @@ def _measure(
         first.timing("costs after a change, and a plan"),
         searching.timing("optimal path, office"),
         planning.timing("the same, pulled tight"),
-        *_replanned(map_costs, cells, paths, rng.spawn(1)[0]),
+        *_time_replanning(map_costs, cells, paths, rng.spawn(1)[0]),
         *_corner_to_corner(size, rng, ratios),
     )
     length = float(np.mean([one.remaining[0] for one in paths]))
@@ -162,7 +162,7 @@ def _measure(
     return SizeFigures(size=size, path_m=length, timings=timings, ratio=worst), map_costs, paths
 
 
-def _replanned(
+def _time_replanning(
     map_costs: Costmap, cells: Cells, paths: list[Path], rng: np.random.Generator
 ) -> tuple[Timing, Timing]:
     """Time from a new map to the path, like decision: a change is elsewhere, or on the path.
@@ -176,7 +176,7 @@ def _replanned(
         planner.replan(costs, _point(old, 0), goal, old)
         for timer, changed in (
             (elsewhere, with_new_furniture(cells, rng)),
-            (ahead, _blocked(map_costs, cells, old, rng)),
+            (ahead, _with_obstacle_on(map_costs, cells, old, rng)),
         ):
             for cells_now, timed in ((changed, timer), (cells, elsewhere)):
                 grid = grid_of(cells_now)
@@ -191,7 +191,9 @@ def _point(path: Path, number: int) -> Point:
     return x, y
 
 
-def _blocked(map_costs: Costmap, cells: Cells, path: Path, rng: np.random.Generator) -> Cells:
+def _with_obstacle_on(
+    map_costs: Costmap, cells: Cells, path: Path, rng: np.random.Generator
+) -> Cells:
     """Return the map with an object of 0.5 m in the middle half of a path."""
     count = len(path.points)
     at = map_costs.cell(*_point(path, int(rng.integers(count // 4, 3 * count // 4))))
@@ -209,7 +211,7 @@ def _queries(map_costs: Costmap, search: GridSearch, rng: np.random.Generator) -
         far = np.argwhere((np.abs(field / wanted - 1) < SPREAD) & (map_costs.cost < 2))
         for _ in range(GOALS if len(far) else 0):
             end = _cell(far[rng.integers(len(far))])
-            start, goal = _middle(map_costs, begin), _middle(map_costs, end)
+            start, goal = _cell_middle(map_costs, begin), _cell_middle(map_costs, end)
             yield Query(begin, end, start, goal, float(field[end]))
 
 
@@ -217,7 +219,7 @@ def _cell(at: NDArray[np.intp]) -> tuple[int, int]:
     return int(at[0]), int(at[1])
 
 
-def _middle(map_costs: Costmap, cell: tuple[int, int]) -> Point:
+def _cell_middle(map_costs: Costmap, cell: tuple[int, int]) -> Point:
     x, y = map_costs.points(np.array(cell[:1]), np.array(cell[1:]))[0].tolist()
     return x, y
 

@@ -147,7 +147,7 @@ class Course:
         self._planner = ArmPlanner(model.model, description)
         around = surroundings(description)
         self._checker = CollisionChecker(kinematics, around, margin=MARGIN_M)
-        self._arm = _before(shelf, robot, model)
+        self._arm = _arm_with_shelf(shelf, robot, model)
         self._held = 0
         self._refused, self._no_way, self._touched = Counter[str](), Counter[str](), list[str]()
         self._solved, self._unsolved, self._planned = list[float](), list[float](), list[float]()
@@ -160,7 +160,7 @@ class Course:
         if not self._has_posture(point, pitch, self._arm.posture(self._kinematics.names)):
             return
         self._arm.touched.clear()
-        arrived = self._follow(point, pitch)
+        arrived = self._reach_goal(point, pitch)
         for _ in range(REST_TICKS):
             self._arm.step(Intent(behaviour="reach", reason="done"))
         if self._arm.touched:
@@ -173,7 +173,7 @@ class Course:
                 float(np.linalg.norm(self._kinematics.forward(posture).position - point))
             )
 
-    def _follow(self, point: Floats, pitch: float | None) -> bool:
+    def _reach_goal(self, point: Floats, pitch: float | None) -> bool:
         """Return whether the arm reaches a goal; if safety holds it up, plan again."""
         for _ in range(1 + HOLD_UPS):
             begin_s = time.perf_counter()
@@ -213,7 +213,7 @@ class Course:
         )  # fmt: skip
 
 
-def _before(shelf: KeepOut, robot: RobotFile, model: SimModel) -> JudgedArm:
+def _arm_with_shelf(shelf: KeepOut, robot: RobotFile, model: SimModel) -> JudgedArm:
     """Return an arm on a floor, with a shelf in front of it."""
     place = " ".join(f"{one:g}" for one in shelf.center)
     half = " ".join(f"{one / 2:g}" for one in shelf.size)

@@ -30,7 +30,7 @@ def reachable_poses(body: BodyDescription, world: World) -> Floats:
     found = [frontier]
     while len(frontier):
         moved = np.concatenate([
-            _free(distances, outline, margin, world, frontier, motion) for motion in motions
+            _free_ends(distances, outline, margin, world, frontier, motion) for motion in motions
         ])  # fmt: skip
         bins, first = np.unique(_bins(moved, world), return_index=True)
         new = ~np.isin(bins, seen, assume_unique=True)
@@ -52,7 +52,7 @@ def _motions(body: BodyDescription) -> list[tuple[float, float, float]]:
     return motions
 
 
-def _free(
+def _free_ends(
     distances: Floats, outline: Floats, margin: float, world: World, poses: Floats,
     motion: tuple[float, float, float],
 ) -> Floats:  # fmt: skip
@@ -65,11 +65,11 @@ def _free(
         cosine, sine = np.cos(middle), np.sin(middle)
         x, y = poses[:, 0] + ahead * cosine - aside * sine, poses[:, 1] + ahead * sine
         moved = np.column_stack((x, y + aside * cosine, poses[:, 2] + turn))
-        free &= _rooms(distances, outline, world, moved) > margin
+        free &= _clearances(distances, outline, world, moved) > margin
     return moved[free]
 
 
-def _rooms(distances: Floats, outline: Floats, world: World, poses: Floats) -> Floats:
+def _clearances(distances: Floats, outline: Floats, world: World, poses: Floats) -> Floats:
     """Return the outline's clearance [m] at each of `poses` (n, 3)."""
     cosine, sine = np.cos(poses[:, 2:]), np.sin(poses[:, 2:])
     x = poses[:, :1] + cosine * outline[:, 0] - sine * outline[:, 1]

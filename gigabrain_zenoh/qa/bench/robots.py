@@ -131,7 +131,7 @@ async def measure_robots(
         await ensure_compiled(warm_up)
     show(f"starting {count} x {body} in {world}")
     start = _Start(count)
-    watching = asyncio.ensure_future(_busy(start, seconds, show))
+    watching = asyncio.ensure_future(_busy_share(start, seconds, show))
     deployments = (
         Deployment(
             body=body, world=world, seed=number, resume="auto", router=LOOPBACK,
@@ -141,7 +141,7 @@ async def measure_robots(
         for number in range(count)
     )  # fmt: skip
     robots = await asyncio.gather(
-        *(_robot(number, one, seconds, start) for number, one in enumerate(deployments, 1))
+        *(_run_robot(number, one, seconds, start) for number, one in enumerate(deployments, 1))
     )
     return RobotsResult(
         body=body,
@@ -153,7 +153,7 @@ async def measure_robots(
     )
 
 
-async def _busy(start: _Start, seconds: float, show: Callable[[str], None]) -> float:
+async def _busy_share(start: _Start, seconds: float, show: Callable[[str], None]) -> float:
     """Return the share of all cores that was busy while the robots drove."""
     await start.all.wait()
     await asyncio.sleep(SETTLE_S)
@@ -163,7 +163,9 @@ async def _busy(start: _Start, seconds: float, show: Callable[[str], None]) -> f
     return psutil.cpu_percent() / 100
 
 
-async def _robot(number: int, deployment: Deployment, seconds: float, start: _Start) -> FleetRobot:
+async def _run_robot(
+    number: int, deployment: Deployment, seconds: float, start: _Start
+) -> FleetRobot:
     async with contextlib.AsyncExitStack() as stack:
         try:
             robot = measured_robot(deployment, ready_s=START_S)
@@ -174,12 +176,12 @@ async def _robot(number: int, deployment: Deployment, seconds: float, start: _St
             start.settled()
         try:
             await start.wait(group)
-            return await _measured(number, group, bus, seconds)
+            return await _measure(number, group, bus, seconds)
         except Failed as error:
             return FleetRobot(number=number, problem=str(error))
 
 
-async def _measured(number: int, group: ProcessGroup, bus: Bus, seconds: float) -> FleetRobot:
+async def _measure(number: int, group: ProcessGroup, bus: Bus, seconds: float) -> FleetRobot:
     await group.run_for(SETTLE_S)
     loop = asyncio.get_running_loop()
     before, cpu_s, begin_s = await _report(group, bus), group.cpu_s, loop.time()

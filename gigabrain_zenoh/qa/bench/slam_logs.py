@@ -150,10 +150,12 @@ def hits(log: LaserLog, at: int) -> Floats:
 
 def cells_filled(bodies: list[Floats], poses: Floats, turns: Floats) -> Floats:
     """Return the number of cells that the scans fill at `poses` (n, 3), for each turn [rad]."""
-    return np.array([_filled(bodies, compose(np.array((0, 0, turn)), poses)) for turn in turns])
+    return np.array(
+        [_count_filled(bodies, compose(np.array((0, 0, turn)), poses)) for turn in turns]
+    )
 
 
-def _filled(bodies: list[Floats], poses: Floats) -> float:
+def _count_filled(bodies: list[Floats], poses: Floats) -> float:
     counts = np.array([len(body) for body in bodies])
     points = np.concatenate(bodies)
     x, y, yaw = np.repeat(poses, counts, axis=0).T

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 CLOSE_LOOPS_S = 60.0  # long enough that a slow machine makes the same map
 COLD_SCANS = 20  # without timing, at the start
-TICKS_A_MINUTE = round(60e9 / TICK_NS)
+TICKS_PER_MINUTE = round(60e9 / TICK_NS)
 
 Progress = Callable[[], None]  # called after each minute
 
@@ -148,18 +148,18 @@ def map_world(body: str, world: str, seed: int, minutes: float, progress: Progre
         raise ConfigError(f"{body} has no lidar, and so makes no map")
     run = _MappingRun(SlamMap(CLOSE_LOOPS_S))
     sampler = GrowthSampler()
-    for count, one in enumerate(roaming.ticks(round(minutes * TICKS_A_MINUTE)), 1):
+    for count, one in enumerate(roaming.ticks(round(minutes * TICKS_PER_MINUTE)), 1):
         run.fusion.add(one.state, roaming.body)
         if one.scan:
             run.scan(lidar, one.scan, np.array(one.truth))
-        if count % TICKS_A_MINUTE == 0:
-            sampler.minute(rss_bytes() / 1e6, run.chart.grid())
+        if count % TICKS_PER_MINUTE == 0:
+            sampler.minute(rss_bytes() / 1e6, run.slam_map.grid())
             progress()
     if not len(run.poses):
         raise ConfigError(f"--minutes: {minutes:g} is too short for a scan")
-    truth, report = roaming.simulation.truth, run.chart.report()
-    grid = run.chart.grid()
-    run.chart.close()
+    truth, report = roaming.simulation.truth, run.slam_map.report()
+    grid = run.slam_map.grid()
+    run.slam_map.close()
     poses, true_poses, fused = run.poses, run.in_map(), run.fused
     off = between(true_poses, poses)
     map_from_odometry = compose(poses[0], inverse(fused[0]))
@@ -187,8 +187,8 @@ def map_world(body: str, world: str, seed: int, minutes: float, progress: Progre
 class _MappingRun:
     """Maps scans and states like perception, and keeps the poses."""
 
-    def __init__(self, chart: SlamMap) -> None:
-        self.chart, self.fusion, self.not_localized = chart, OdometryFusion(), 0
+    def __init__(self, slam_map: SlamMap) -> None:
+        self.slam_map, self.fusion, self.not_localized = slam_map, OdometryFusion(), 0
         # flat arrays: an hour of poses hardly changes the measured memory
         self.took_ms, self._poses, self._fused = array("d"), array("d"), array("d")
         self._truth = array("d")  # in the world
@@ -202,7 +202,7 @@ class _MappingRun:
         ends = np.column_stack(hits(lidar, scan, PerceptionConfig().ignore_below))
         begin_s = time.thread_time()
         view = view_of(lidar, scan, ends)
-        place = self.chart.step(view, *way(self._last or sample, sample))
+        place = self.slam_map.step(view, *way(self._last or sample, sample))
         self.took_ms.append((time.thread_time() - begin_s) * 1e3)
         self._last = sample
         self.not_localized += not place.localized

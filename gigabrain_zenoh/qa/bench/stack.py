@@ -210,7 +210,7 @@ async def measure_first_goal(body: str, world: str, show: Callable[[str], None])
                 follows.set()
 
         bus.subscribe(INTENT, on_intent)
-        asking = asyncio.ensure_future(_accepted(group, bus))
+        asking = asyncio.ensure_future(_send_until_accepted(group, bus))
         try:
             await group.until(lambda: asking.done() and follows.is_set(), "a first goal", START_S)
         finally:
@@ -225,7 +225,7 @@ async def measure_first_goal(body: str, world: str, show: Callable[[str], None])
         )
 
 
-async def _accepted(group: ProcessGroup, bus: Bus) -> tuple[float, float, str]:
+async def _send_until_accepted(group: ProcessGroup, bus: Bus) -> tuple[float, float, str]:
     """Return the time and CPU time [s] until a goal is accepted, and the reply's text."""
     while True:
         replies = await bus.ask(GOAL, AHEAD, timeout_s=ASK_TIMEOUT_S)

@@ -115,8 +115,8 @@ def test_wrong_contours_count_as_wrong() -> None:
             contours = seen.see(renderer, STILL, number / 10)
         right = bench._Truth(seen, renderer, EyesWorld((thing,)), STILL)
         wrong = bench._Truth(seen, renderer, EyesWorld((elsewhere,)), STILL)
-    assert bench._found(right, contours) == [True]
-    assert bench._found(right, ()) == [False]
+    assert bench._found_things(right, contours) == [True]
+    assert bench._found_things(right, ()) == [False]
     scores = bench.ClutterScores()
     bench._judge_outlines(right, contours, scores)
     assert scores.wrong == 0

@@ -110,11 +110,11 @@ async def test_a_random_goal_is_drawn_again_while_a_person_blocks_the_way(
 
     monkeypatch.setattr(GoalSender, "_random_place", random_place)
     sender = GoalSender(Net().two, cast("ProcessGroup", Alive()), seed=0)
-    assert await sender._retried(GigabrainError, sender._random_place) == (1.0, 2.0)
+    assert await sender._retry(GigabrainError, sender._random_place) == (1.0, 2.0)
     monkeypatch.setattr(goals, "MAX_SILENCE_S", 0.0)
     places.extend([GigabrainError("none")] * 100)
     with pytest.raises(GigabrainError, match="none"):
-        await sender._retried(GigabrainError, sender._random_place)
+        await sender._retry(GigabrainError, sender._random_place)
 
 
 async def test_a_robot_that_latches_ends_the_course() -> None:
