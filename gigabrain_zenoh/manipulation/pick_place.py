@@ -1,7 +1,7 @@
 """Plans to pick a thing up and to put it down, as phases: trajectories and grips.
 
-    open  hover  descend  close  ease  lift     of a pick
-    traverse  lower  open  retreat              of a place
+    open  hover  descend  close  lift     of a pick
+    traverse  lower  open  retreat        of a place
 
 The executor of a plan checks the grip after `close`: the gripper must stop before its goal.
 """
