@@ -1,4 +1,4 @@
-"""Reads from a robot's state what the planner of an arm needs."""
+"""Reads the inputs of the arm's planner from a robot's state."""
 
 import math
 from collections.abc import Mapping
@@ -16,16 +16,16 @@ from gigabrain_zenoh.manipulation.arm_planner import ArmPlanner, Hold, Plan
 from gigabrain_zenoh.manipulation.joint_trajectory import JointTrajectory
 from gigabrain_zenoh.manipulation.phases import Phase
 
-GRIPS = 0.1  # of the gripper's greatest speed, above which it moves: an encoder's steps are less
-MOVED = 0.02  # [rad] or [m] off the beginning of a plan: it was made for another posture
-SENT = 0.01  # of the gripper's range, within which it was sent to its target
-AT_THINGS = ("descend", "press", "lift", "retreat")  # phases in which an arm moves at a thing
-BASE_M, BASE_RAD = 0.03, 0.05  # by which a base moves at most that stands
-REGRIP = 0.12  # of its range, by which a grip changes at most while something is held
+GRIPPER_MOVES = 0.1  # share of the gripper's maximum speed; the noise of its encoder is smaller
+START_TOLERANCE = 0.02  # [rad] or [m], between the arm and the start of its plan
+SENT_TOLERANCE = 0.01  # share of the gripper's range, between its command and its target
+AT_THINGS = ("descend", "press", "lift", "retreat")  # phases in which the arm is at a thing
+MAX_BASE_M, MAX_BASE_RAD = 0.03, 0.05  # motion of a base that counts as standing
+MAX_REGRIP = 0.12  # share of the gripper's range, change of the grip on a held thing
 
 
 def sent_posture(planner: ArmPlanner, body: BodyDescription, state: RobotState) -> Floats:
-    """Return where the arm's joints were sent (n,) [rad] or [m]."""
+    """Return the commanded positions of the arm's joints (n,) [rad] or [m]."""
     sent = dict(zip((joint.name for joint in body.joints), state.joints_sent, strict=True))
     return np.array([sent[name] for name in planner.arm.names])
 
@@ -33,7 +33,7 @@ def sent_posture(planner: ArmPlanner, body: BodyDescription, state: RobotState) 
 def pace(
     body: BodyDescription, state: RobotState
 ) -> tuple[Mapping[str, float], Mapping[str, float]]:
-    """Return where each joint was sent, and by how much that may be behind [rad] or [m]."""
+    """Return the commanded position of each joint and its allowed lag, both [rad] or [m]."""
     names = [joint.name for joint in body.joints]
     sent = dict(zip(names, state.joints_sent, strict=False))
     measured = {joint.name: joint.position for joint in state.joints}
@@ -41,82 +41,83 @@ def pace(
 
 
 def measured_posture(planner: ArmPlanner, state: RobotState) -> Floats:
-    """Return where the arm's joints are (n,) [rad] or [m]."""
-    found = {joint.name: joint.position for joint in state.joints}
-    return np.array([found[name] for name in planner.arm.names])
+    """Return the measured positions of the arm's joints (n,) [rad] or [m]."""
+    positions = {joint.name: joint.position for joint in state.joints}
+    return np.array([positions[name] for name in planner.arm.names])
 
 
 def measured_efforts(planner: ArmPlanner, state: RobotState) -> Floats | None:
-    """Return the efforts of the arm's joints (n,) [N m] or [N]; None where one is not measured."""
-    found = {joint.name: joint.effort for joint in state.joints}
-    efforts = [found.get(name) for name in planner.arm.names]
+    """Return the efforts of the arm's joints (n,) [N m] or [N]; None if one is not measured."""
+    measured = {joint.name: joint.effort for joint in state.joints}
+    efforts = [measured.get(name) for name in planner.arm.names]
     return None if None in efforts else np.array(efforts)
 
 
 def posture_of(body: BodyDescription, name: NamedPosture) -> dict[str, float]:
-    """Return a posture of the robot's file [rad] or [m]."""
+    """Return a named posture of the robot's file [rad] or [m]."""
     assert body.arm
-    places = body.arm.home if name == "home" else body.arm.carry
-    return dict(zip((joint.name for joint in body.joints), places, strict=True))
+    positions = body.arm.home if name == "home" else body.arm.carry
+    return dict(zip((joint.name for joint in body.joints), positions, strict=True))
 
 
 def begins_at(plan: Plan, posture: Floats) -> bool:
-    """Return whether a plan's first trajectory begins where the arm was sent (n,) [rad] or [m]."""
+    """Return whether a plan starts at the commanded `posture` (n,) [rad] or [m]."""
     first = next((phase.arm for phase in plan.phases if phase.arm), None)
-    return first is None or bool(np.abs(first.positions[0] - posture).max() < MOVED)
+    return first is None or bool(np.abs(first.positions[0] - posture).max() < START_TOLERANCE)
 
 
 def is_at(
     left: Plan, base: Pose, planner: ArmPlanner, body: BodyDescription, state: RobotState
 ) -> bool:
-    """Return whether the arm is on a plan's last way to its thing, and the body still at `base`."""
-    off = relative(base, state.pose)
-    if math.hypot(off.x, off.y) > BASE_M or abs(off.yaw) > BASE_RAD:
+    """Return whether the arm is at the thing of plan `left`, and the body still at `base`."""
+    motion = relative(base, state.pose)
+    if math.hypot(motion.x, motion.y) > MAX_BASE_M or abs(motion.yaw) > MAX_BASE_RAD:
         return False
     if len(state.joints_sent) != len(body.joints):
         return False
-    slack = MOVED + np.array([joint.gains.max_correction for joint in planner.arm.joints])
+    max_lags = np.array([joint.gains.max_correction for joint in planner.arm.joints])
+    tolerance = START_TOLERANCE + max_lags
     posture = sent_posture(planner, body, state)
     ways = [phase.arm for phase in left.phases if phase.arm and phase.name in AT_THINGS]
-    return any((np.abs(way.positions - posture) < slack).all(axis=1).any() for way in ways)
+    return any((np.abs(way.positions - posture) < tolerance).all(axis=1).any() for way in ways)
 
 
 def rest_of_place(left: Plan, posture: Floats) -> Plan:
-    """Return how to let go and retreat as planned, for an arm that was sent to `posture` (n,)."""
+    """Return the rest of plan `left`, to let go and retreat, from the commanded `posture` (n,)."""
     *_, let_go, retreat = left.phases
     way = retreat.arm
     assert way
-    begun = int(np.abs(way.positions - posture).max(axis=1).argmin())
+    start = int(np.abs(way.positions - posture).max(axis=1).argmin())
     rest = JointTrajectory(
-        names=way.names, times=way.times[begun:] - way.times[begun],
-        positions=way.positions[begun:], velocities=way.velocities[begun:],
-        accelerations=way.accelerations[begun:],
+        names=way.names, times=way.times[start:] - way.times[start],
+        positions=way.positions[start:], velocities=way.velocities[start:],
+        accelerations=way.accelerations[start:],
     )  # fmt: skip
     return Plan(phases=(let_go, Phase(name="retreat", arm=rest)))
 
 
 def holds(planner: ArmPlanner, hold: Hold, state: RobotState) -> bool:
-    """Return whether the gripper has stopped short of where it was sent."""
+    """Return whether a thing stops the gripper short of its grip."""
     return planner.holds(gripper_place(planner, state, hold.grip), hold.grip)
 
 
 def still_held(
     planner: ArmPlanner, body: BodyDescription, state: RobotState, hold: Hold
 ) -> Hold | None:
-    """Return `hold` by where the gripper was sent meanwhile; None if it holds nothing any more."""
+    """Return `hold` with the newest command of the gripper; None if it lost the thing."""
     gripper = planner.arm.gripper
     assert gripper
     sent = sent_place(planner, body, state, hold.grip)
     grip = hold.grip if sent_to(planner, body, state, hold.grip) else sent
     measured = gripper_place(planner, state, sent)
     squeezes = (sent - measured) * (hold.grip - hold.opening) > 0.0
-    near = abs(grip - hold.grip) <= REGRIP * (gripper.upper - gripper.lower)
+    near = abs(grip - hold.grip) <= MAX_REGRIP * (gripper.upper - gripper.lower)
     held = squeezes and near and planner.holds(measured, sent)
     return replace(hold, grip=grip) if held else None
 
 
 def squeezes(planner: ArmPlanner, body: BodyDescription, state: RobotState, place: float) -> bool:
-    """Return whether something stops the gripper short of where it was sent, towards `place`."""
+    """Return whether something stops the gripper short of its command, towards `place`."""
     sent = sent_place(planner, body, state, place)
     measured = gripper_place(planner, state, sent)
     return planner.holds(measured, sent) and (sent - measured) * (place - measured) > 0.0
@@ -125,36 +126,36 @@ def squeezes(planner: ArmPlanner, body: BodyDescription, state: RobotState, plac
 def gripper_moves(
     planner: ArmPlanner, state: RobotState, body: BodyDescription, phase: Phase
 ) -> bool:
-    """Return whether the gripper is still on its way: it moves, or was not sent there yet."""
+    """Return whether the gripper moves, or was not sent to its target of `phase` yet."""
     gripper = planner.arm.gripper
     if gripper is None or phase.gripper is None:
         return False
     moves = any(
-        joint.name == gripper.name and abs(joint.velocity) > GRIPS * gripper.max_speed
+        joint.name == gripper.name and abs(joint.velocity) > GRIPPER_MOVES * gripper.max_speed
         for joint in state.joints
     )
     return moves or not sent_to(planner, body, state, phase.gripper)
 
 
 def sent_to(planner: ArmPlanner, body: BodyDescription, state: RobotState, place: float) -> bool:
-    """Return whether the gripper was sent to a place [rad] or [m], or where that is not known."""
+    """Return whether the gripper was sent to `place` [rad] or [m]; also if that is unknown."""
     gripper = planner.arm.gripper
     assert gripper
-    slack = gripper.gains.max_correction + SENT * (gripper.upper - gripper.lower)
-    return abs(sent_place(planner, body, state, place) - place) <= slack
+    tolerance = gripper.gains.max_correction + SENT_TOLERANCE * (gripper.upper - gripper.lower)
+    return abs(sent_place(planner, body, state, place) - place) <= tolerance
 
 
 def sent_place(
     planner: ArmPlanner, body: BodyDescription, state: RobotState, unknown: float
 ) -> float:
-    """Return where the gripper was sent [rad] or [m]."""
+    """Return the commanded position of the gripper [rad] or [m], or `unknown`."""
     assert planner.arm.gripper
     sent = dict(zip((joint.name for joint in body.joints), state.joints_sent, strict=False))
     return sent.get(planner.arm.gripper.name, unknown)
 
 
 def gripper_place(planner: ArmPlanner, state: RobotState, unknown: float) -> float:
-    """Return where the gripper is [rad] or [m]."""
+    """Return the measured position of the gripper [rad] or [m], or `unknown`."""
     gripper = planner.arm.gripper
     name = gripper.name if gripper else ""
     return next((joint.position for joint in state.joints if joint.name == name), unknown)
@@ -166,7 +167,7 @@ def off_from(
     wanted: Mapping[str, float],
     which: Literal["path_tolerance", "goal_tolerance"],
 ) -> str:
-    """Return which joint is too far from where it should be, and how far; empty for none."""
+    """Describe the first joint that is off from `wanted` by more than its tolerance, if any."""
     measured = {joint.name: joint.position for joint in state.joints}
     for joint in body.joints:
         if joint.name in wanted:

@@ -1,4 +1,4 @@
-"""Detects contact at an arm's tool: whether it presses against something, or a person pulls."""
+"""Detects contact at an arm's tool: it presses against something, or a person pulls."""
 
 import math
 from dataclasses import dataclass
@@ -14,17 +14,17 @@ from gigabrain_zenoh.decision.arm_readings import (
 from gigabrain_zenoh.manipulation.arm_planner import ArmPlanner
 from gigabrain_zenoh.manipulation.contact import ContactSense, Push
 
-TOUCHED_N, TOUCHED_M = 1.0, 0.003  # of a push, from which something was touched
-PRESSED_M = 0.015  # by which the tool lags where it is pressed enough, if efforts do not tell
-PULLED_N, PULLED_M, PULLED_TICKS = 2.0, 0.008, 5  # of a person that pulls
+TOUCHED_N, TOUCHED_M = 1.0, 0.003  # a stronger push, or a longer lag, is a touch
+PRESSED_M = 0.015  # a longer lag counts as pressed, where efforts are missing or too low
+PULLED_N, PULLED_M, PULLED_TICKS = 2.0, 0.008, 5  # minimum force, lag and time of a pull
 
 
 @dataclass(frozen=True, kw_only=True)
 class Pressure:
     """Force and lag of a tool along its approach."""
 
-    newtons: float | None  # None where efforts are not measured
-    metres: float  # by which it lags
+    newtons: float | None  # force; None if efforts are not measured
+    metres: float  # lag
 
     @property
     def touched(self) -> bool:
@@ -32,7 +32,7 @@ class Pressure:
         return (self.newtons or 0.0) > TOUCHED_N or self.metres > TOUCHED_M
 
     def reaches(self, force: float) -> bool:
-        """Return whether it is as much as `force` [N], or the lag says so."""
+        """Return whether the tool presses with `force` [N], or lags by more than PRESSED_M."""
         return (self.newtons or 0.0) >= force or self.metres > PRESSED_M
 
     def __str__(self) -> str:
@@ -40,7 +40,7 @@ class Pressure:
 
 
 class Touch:
-    """Compares each state with the first ones, in which nothing is touched."""
+    """Compares each state with the first ones, which have no contact."""
 
     def __init__(self, planner: ArmPlanner) -> None:
         self._planner, self._sense = planner, ContactSense(planner.arm)
@@ -56,7 +56,7 @@ class Touch:
         return Pressure(newtons=force, metres=float(push.lag @ approach))
 
     def is_pulled(self, body: BodyDescription, state: RobotState) -> bool:
-        """Return whether a person has pulled for PULLED_TICKS."""
+        """Return whether a person pulls, since PULLED_TICKS or longer."""
         push = self._feel(body, state)
         pulls = push is not None and (
             float(np.linalg.norm(push.lag)) > PULLED_M

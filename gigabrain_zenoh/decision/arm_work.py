@@ -33,18 +33,18 @@ Planned = Plan | NoWay
 
 @dataclass(frozen=True, kw_only=True)
 class WorkInputs:
-    """State, things and grip that an action is planned with."""
+    """Inputs for the plan of an action."""
 
     state: RobotState
     body: BodyDescription
-    things: Mapping[str, Solid]  # that are around
+    things: Mapping[str, Solid]  # around the arm
     hold: Hold | None
-    misses: int  # grasps that have failed
-    drives: bool  # the body may go to what it does not reach
+    misses: int  # failed grasps of this command
+    drives: bool  # the body can drive to a thing out of reach
 
 
 def work_for(planner: ArmPlanner, do: ArmAction, now: WorkInputs) -> Callable[[], Planned] | str:
-    """Return what plans an action, or why it cannot be planned."""
+    """Return a function that plans an action, or why it cannot be planned."""
     if len(now.state.joints_sent) != len(now.body.joints):
         return "the joints are not measured, or limp"
     name = thing_meant(do)
@@ -53,7 +53,7 @@ def work_for(planner: ArmPlanner, do: ArmAction, now: WorkInputs) -> Callable[[]
     if name is not None and name not in now.things:
         return f"where {name} is, is not known"
     posture, hold = sent_posture(planner, now.body, now.state), now.hold
-    others = {one: thing_of(one, solid) for one, solid in now.things.items()}
+    others = {other: thing_of(other, solid) for other, solid in now.things.items()}
     thing = others.pop(name) if name is not None else None
     around = [*others.values()]
     gripper_at = gripper_place(planner, now.state, 0.0) if planner.arm.gripper else None
@@ -88,13 +88,13 @@ def work_for(planner: ArmPlanner, do: ArmAction, now: WorkInputs) -> Callable[[]
 
 
 def names_gripper(body: BodyDescription, do: ArmAction) -> bool:
-    """Return whether an action gives the joint of the gripper a position among others."""
+    """Return whether an action is a posture that also moves the gripper's joint."""
     grippers = {joint.name for joint in body.joints if joint.part == "gripper"}
     return isinstance(do, TakePosture) and not isinstance(do.to, str) and bool(grippers & {*do.to})
 
 
 def moving(run: PhaseRun, tick: int, number: int, behaviour: str) -> StepResult:
-    """Return the intent to go on with a plan, and the progress of the command."""
+    """Return the intent that continues a plan, and the progress of the command."""
     joints, window = run.wish(tick)
     text = run.phase.name if run.phase else "coming to rest"
     outcome = StepOutcome(

@@ -1,4 +1,4 @@
-"""Records what the gripper holds, and keeps its grip, also while the body drives."""
+"""Records what the gripper holds, and controls its grip while the arm or the body moves."""
 
 from gigabrain_schemas.body import BodyDescription, RobotState
 from gigabrain_schemas.brain import JointTarget
@@ -14,38 +14,38 @@ from gigabrain_zenoh.manipulation.arm_planner import ArmPlanner, Hold
 from gigabrain_zenoh.manipulation.collision import Thing
 from gigabrain_zenoh.manipulation.phases import Phase, PhaseRun
 
-LONG_TICKS = 50  # to move on, after which it stays where it was sent
-REST_TICKS = 25  # that a gripper rests before its grip is judged: what it holds springs back
-THERE = 0.001  # of the gripper's range, within which it was sent where it should be
+MAX_MOVE_TICKS = 50  # then the gripper stays at its last command
+REST_TICKS = 25  # before the grip is judged: the held thing springs back
+AT_PLACE = 0.001  # share of the gripper's range, tolerance of its command
 
 
 class Grip:
-    """The thing in the gripper, and where the gripper was sent to hold it.
+    """The thing in the gripper, and the gripper position that holds it.
 
-    A gripper that a command has closed may hold something too: then there is a place, but no thing.
-    It keeps the gripper from squeezing too hard for long, and from letting a thing creep out.
+    A gripper closed by a command may hold something unknown: a position without a thing. The grip
+    is adjusted at rest, so that it is not too hard for long, and no thing creeps out.
     """
 
     def __init__(self, recalled: Held | None = None) -> None:
-        """Begin with nothing, until `recall` tells whether it holds what it held at a restart."""
-        self.moves = False  # it was not sent all the way there yet
-        self.firm_tick = 0  # at which it was last made firm for an arm that moves
+        """Start empty; `recall` checks if the gripper still holds what it held before a restart."""
+        self.moves = False  # its command has not reached `_place` yet
+        self.firm_tick = 0  # of the last `make_firm`
         self._recalled = recalled
         self._thing: Thing | None = None
-        self._opening = 0.0  # [rad] or [m], where the gripper goes to let go of the thing
-        self._place: float | None = None  # [rad] or [m], where it was sent to hold something
-        self._since = 0  # tick since which it rests, or moves
+        self._opening = 0.0  # [rad] or [m], position that releases the thing
+        self._place: float | None = None  # [rad] or [m], command that holds something
+        self._since_tick = 0  # of its rest or motion
 
     @property
     def hold(self) -> Hold | None:
-        """Return what the gripper holds, as the planner knows it."""
+        """The held thing in the planner's format; None if there is none, or it is unknown."""
         if self._thing is None or self._place is None:
             return None
         return Hold(thing=self._thing, grip=self._place, opening=self._opening)
 
     @property
     def held(self) -> Held | None:
-        """Return what the gripper holds, or held before a restart, for the file of tasks."""
+        """What the gripper holds, or held before a restart, in the format of the task file."""
         if self._recalled is not None:
             return self._recalled
         hold = self.hold
@@ -53,27 +53,27 @@ class Grip:
 
     @property
     def text(self) -> str:
-        """Return what the gripper holds, for people; empty for nothing."""
+        """What the gripper holds, as text for users; empty for nothing."""
         return f"it holds {self._thing.name}" if self._thing else ""
 
     def take(self, hold: Hold) -> None:
         """Record that the gripper holds a thing."""
         self._thing, self._opening = hold.thing, hold.opening
-        self._send(hold.grip)
+        self._set_place(hold.grip)
 
     def close_at(self, planner: ArmPlanner, state: RobotState, place: float) -> None:
-        """Record that a command has moved the gripper, which holds what stops it on the way."""
+        """Record that a command moved the gripper; it holds whatever stopped it before `place`."""
         self.release()
         if planner.holds(gripper_place(planner, state, place), place):
-            self._send(place)
+            self._set_place(place)
 
     def release(self) -> None:
         """Record that the gripper holds nothing."""
         self._thing = None
-        self._send(None)
+        self._set_place(None)
 
     def recall(self, planner: ArmPlanner, body: BodyDescription, state: RobotState) -> None:
-        """Take what the gripper held before a restart, once, if it agrees."""
+        """Restore what the gripper held before a restart, if the measured state agrees; once."""
         recalled, self._recalled = self._recalled, None
         if recalled is None or planner.arm.gripper is None:
             return
@@ -81,46 +81,46 @@ class Grip:
             if hold := still_held(planner, body, state, hold_of(recalled)):
                 self.take(hold)
         elif squeezes(planner, body, state, recalled):
-            self._send(recalled)
+            self._set_place(recalled)
         if self._place is not None:
-            self._send(sent_place(planner, body, state, self._place))
+            self._set_place(sent_place(planner, body, state, self._place))
 
     def keeps(self, planner: ArmPlanner, body: BodyDescription, state: RobotState) -> bool:
-        """Return whether the thing is still held, maybe where the gripper was sent meanwhile."""
+        """Return whether the thing is still held, also after a small change of the command."""
         hold = self.hold
         if hold and (hold := still_held(planner, body, state, hold)):
-            self._send(hold.grip)
+            self._set_place(hold.grip)
         return hold is not None
 
     def make_firm(self, planner: ArmPlanner, run: PhaseRun, state: RobotState) -> None:
-        """Have `run` squeeze the thing as hard as a moving arm should; it may spring back."""
+        """Insert a phase into `run` that squeezes the thing firmly enough for a moving arm."""
         self.firm_tick = state.tick
         assert self._place is not None
         measured = gripper_place(planner, state, self._place)
         place = planner.squeeze(measured, self._place, moving=True)
         if place != self._place:
             run.insert(Phase(name="squeeze", gripper=place))
-            self._send(place)
+            self._set_place(place)
 
     def follow(
         self, planner: ArmPlanner, body: BodyDescription, state: RobotState
     ) -> tuple[JointTarget, ...]:
-        """Return where the gripper of a still arm should go now; nothing where it may stay."""
+        """Return the target that adjusts the grip of a resting arm; nothing if it is good."""
         gripper, place = planner.arm.gripper, self._place
         if gripper is None or place is None:
             return ()
-        passed, sent = state.tick - self._since, sent_place(planner, body, state, place)
-        there = abs(sent - place) <= THERE * (gripper.upper - gripper.lower)
-        if self.moves and (there or not 0 <= passed < LONG_TICKS):
-            place, self.moves, self._since = sent, False, state.tick
-        elif there and not self.moves and not 0 <= passed < REST_TICKS:
+        elapsed, sent = state.tick - self._since_tick, sent_place(planner, body, state, place)
+        sent_there = abs(sent - place) <= AT_PLACE * (gripper.upper - gripper.lower)
+        if self.moves and (sent_there or not 0 <= elapsed < MAX_MOVE_TICKS):
+            place, self.moves, self._since_tick = sent, False, state.tick
+        elif sent_there and not self.moves and not 0 <= elapsed < REST_TICKS:
             measured = gripper_place(planner, state, place)
             if planner.holds(measured, place):
                 place = planner.squeeze(measured, place, moving=False)
-                self.moves, self._since = place != self._place, state.tick
+                self.moves, self._since_tick = place != self._place, state.tick
         self._place = place
         return (JointTarget(name=gripper.name, position=place),) if self.moves else ()
 
-    def _send(self, place: float | None) -> None:
+    def _set_place(self, place: float | None) -> None:
         self.moves = self.moves and place == self._place
         self._place = place

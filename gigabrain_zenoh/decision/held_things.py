@@ -1,4 +1,4 @@
-"""Things as missions and their file have them, and as the planner of an arm has them."""
+"""Converts things between the formats of missions, the task file and the arm's planner."""
 
 import math
 
@@ -12,7 +12,7 @@ from gigabrain_zenoh.manipulation.collision import Thing, turned
 
 
 def thing_of(name: str, solid: Solid) -> Thing:
-    """Return a thing of a mission as the planner knows it."""
+    """Return a mission's thing in the planner's format."""
     assert solid.at
     position, axes = np.array(solid.at), turned(solid.yaw)
     if solid.box:
@@ -24,13 +24,13 @@ def thing_of(name: str, solid: Solid) -> Thing:
 
 
 def solid_of(thing: Thing, at: Floats, yaw: float) -> Solid:
-    """Return a thing as a mission knows it, at a place (3,) [m]."""
-    box, round_ = thing.kind == "box", thing.kind == "cylinder"
+    """Return a thing in a mission's format, at a place (3,) [m]."""
+    box, cylinder = thing.kind == "box", thing.kind == "cylinder"
     x, y, z = at.tolist()
     return Solid(
         box=thing.size if box else None,  # type: ignore[arg-type]
-        cylinder=thing.size if round_ else None,  # type: ignore[arg-type]
-        sphere=None if box or round_ else thing.size[0],
+        cylinder=thing.size if cylinder else None,  # type: ignore[arg-type]
+        sphere=None if box or cylinder else thing.size[0],
         at=(x, y, z),
         yaw=yaw,
     )
@@ -39,16 +39,16 @@ def solid_of(thing: Thing, at: Floats, yaw: float) -> Solid:
 def placed(
     planner: ArmPlanner, measured: Floats, action: ArmAction, hold: Hold, body: BodyDescription
 ) -> tuple[str, Solid]:
-    """Return a thing that was let go of by an arm at `measured` (n,), and where it stands now."""
+    """Return the name and solid of a thing that an arm at `measured` (n,) just let go of."""
     tool, thing = planner.arm.forward(measured), hold.thing
     at, ahead = tool.place(thing.position), tool.axes @ thing.axes[:, 0]
-    if isinstance(action, PlaceThing):  # it stands on something there, or on the floor
+    if isinstance(action, PlaceThing):  # it now stands on something, or on the floor
         at[2] = action.at[2] if len(action.at) == 3 else standing_height(hold, body)
     return thing.name, solid_of(thing, at, math.atan2(ahead[1], ahead[0]))
 
 
 def standing_height(hold: Hold, body: BodyDescription) -> float:
-    """Return how high the middle of what is held is while it stands on the floor [m]."""
+    """Return the height of a held thing's centre when it stands on the floor [m]."""
     return floor_of(body) + float(hold.thing.half[2])
 
 
@@ -59,7 +59,7 @@ def floor_of(body: BodyDescription) -> float:
 
 
 def held_thing(hold: Hold) -> HeldThing:
-    """Return what the gripper holds as it is kept over a restart."""
+    """Return a hold in the format of the task file."""
     return HeldThing(
         name=hold.thing.name,
         solid=solid_of(hold.thing, hold.thing.position, 0.0),
@@ -70,7 +70,7 @@ def held_thing(hold: Hold) -> HeldThing:
 
 
 def hold_of(held: HeldThing) -> Hold:
-    """Return what the gripper holds as the planner knows it."""
+    """Return a hold of the task file in the planner's format."""
     thing = thing_of(held.name, held.solid)
     axes = np.array(held.axes).reshape(3, 3)
     return Hold(

@@ -1,4 +1,4 @@
-"""Moves the arm: plans each command in a worker thread, and carries it out from tick to tick."""
+"""Moves the arm: plans each command in a worker thread, and executes the plan tick by tick."""
 
 from collections import deque
 from collections.abc import Callable, Mapping
@@ -69,12 +69,12 @@ from gigabrain_zenoh.manipulation.collision import Thing
 from gigabrain_zenoh.manipulation.phases import PhaseRun
 from gigabrain_zenoh.manipulation.pick_place import NoWay
 
-TRIES = 3  # to pick a thing up, each with another grasp
-HOLD_UPS = 5  # of one command, after which it fails
-MAX_RESULTS = 64  # that are kept
-WAIT_TICKS = 100  # for a joint that the gate holds back, before another way is planned
+TRIES = 3  # grasps of a thing, each one different
+HOLD_UPS = 5  # a command with more hold-ups fails
+MAX_RESULTS = 64  # of commands, that are remembered
+WAIT_TICKS = 100  # until the arm plans again, for a joint that the gate holds back
 MISSED = f"it was not caught, {TRIES} times"
-CARRYING = ("lift", "traverse", "lower", "move")  # phases in which a thing has to be held
+CARRYING = ("lift", "traverse", "lower", "move")  # phases in which the gripper must hold a thing
 NO_MODEL = Idle("waiting", "waiting: for the arm's model, robot/arm_model")
 NOT_MEASURED = Idle("waiting", "waiting: for all joints to be measured")
 PLANNING = Idle("planning", "planning")
@@ -86,33 +86,33 @@ class Manipulator:
     """Carries out one command for the arm at a time."""
 
     def __init__(self, bus: Bus, behaviour: str, held: Held | None = None) -> None:
-        """Prepare for an arm; `held` is what its gripper held before a restart."""
+        """Prepare for one arm; `held` is what its gripper held before a restart."""
         self._behaviour, self._in_time = behaviour, bus.input_log.in_time
         self._models, self._display = bus.latest(ARM_MODEL), PlanDisplay(bus)
         self._pool = ThreadPoolExecutor(1, thread_name_prefix="arm")
-        self._made_for: tuple[str, BodyDescription] | None = None
-        self._making: Future[ArmPlanner] | None = None
+        self._planner_inputs: tuple[str, BodyDescription] | None = None  # MJCF and body
+        self._loading: Future[ArmPlanner] | None = None
         self._planner: ArmPlanner | None = None
         self._planning: Future[Planned] | None = None
         self._plan = Plan(phases=())
         self._run: PhaseRun | None = None
         self._grip = Grip(held)
-        self._number = 0  # of the present command, or of the last one
-        self._misses = 0  # grasps of it that caught nothing
-        self._hold_ups = 0  # of it, by a joint that did not follow
-        self._achieved = StepOutcome()  # of a command that is done but for the way back
-        # the same of earlier commands, which go on after a task that came first
+        self._number = 0  # of the current or last command
+        self._misses = 0  # failed grasps in this command
+        self._hold_ups = 0  # in this command: a joint did not follow
+        self._achieved = StepOutcome()  # its result, while the arm only has to move back
+        # results of earlier commands: a command continues after a task that interrupted it
         self._results: deque[StepOutcome] = deque(maxlen=MAX_RESULTS)
-        self._put_down: StepOutcome | None = None  # of the command whose thing is being let go of
-        self._left: Plan | None = None  # that was cut short: the hand may still be at its thing
-        self._base = Pose(x=0.0, y=0.0, yaw=0.0)  # of the body when the arm moved last
-        self._interim = False  # it goes back from there, or out of a camera's sight
-        self._why_not = ""  # why it fails once it is back
-        self._touch: Touch | None = None  # while it presses, or offers something
+        self._put_down: StepOutcome | None = None  # result once the gripper lets go of its thing
+        self._abandoned: Plan | None = None  # was cut short: the hand may still be at the thing
+        self._base_pose = Pose(x=0.0, y=0.0, yaw=0.0)  # of the body when the arm last moved
+        self._detour = False  # this plan backs off, or clears a view; then the arm plans again
+        self._failure = ""  # failure to report after backing off
+        self._touch: Touch | None = None  # while pressing or offering
         self._lookout = Lookout()
-        self._seen_as: int | None = None  # number by which a camera knew what is held
+        self._camera_id: int | None = None  # number of the picked thing in what cameras see
         self._target: Thing | None = None  # to be picked up, where it stands
-        self._put: PutDown | None = None  # what a camera knew, and has not seen since
+        self._put: PutDown | None = None  # was put down, and not seen there since
 
     def step(
         self,
@@ -123,10 +123,11 @@ class Manipulator:
         held: str,
         seen: tuple[SeenSolid, ...] = (),
     ) -> StepResult:
-        """Carry out `command` for one step, or hold still as `idle` says.
+        """Carry out `command` for one step; without one, hold still with the reason `idle`.
 
-        While the body does not follow, as `held` says, the arm holds; it plans again afterwards.
-        Things without a place are where they are `seen`, in the body's frame.
+        `held` is the reason why the body ignores decision, if it does. Then the arm holds still,
+        and plans again afterwards. Things without a place are located in `seen`, in the body's
+        frame.
         """
         intent, outcome = self._step(state, body, command, idle, held, seen)
         if self._planner and not self._run and not held:
@@ -151,11 +152,11 @@ class Manipulator:
             self._misses = self._hold_ups = 0
             self._lookout.reset()
         try:
-            planner = self._ready(body)
+            planner = self._current_planner(body)
         except GigabrainError as error:
             return self._fail(str(error))
         if self._run:
-            self._base = state.pose
+            self._base_pose = state.pose
         measured = {joint.name for joint in body.joints} <= {joint.name for joint in state.joints}
         if planner and measured and not held:
             self._grip.recall(planner, body, state)
@@ -165,44 +166,47 @@ class Manipulator:
             return self._still(idle)
         if held:
             self._touch = None
-            if self._run:  # a plan that is being made will do, if the arm has not been moved then
+            if self._run:  # a plan in the making stays valid unless the arm is moved
                 self._interrupt()
             return self._still(Idle("waiting", f"waiting: {held}"), held=True)
         if planner is None:
             return self._still(NO_MODEL)
         if not measured:
             return self._still(NOT_MEASURED)
-        near = self._left and is_at(self._left, self._base, planner, body, state)
-        if self._run is None and self._left and not near:  # the base, or an operator, has moved it
-            self._left = self._put_down = None
-        if self._run is None and self._achieved.number and not self._left:
+        at_thing = self._abandoned and is_at(self._abandoned, self._base_pose, planner, body, state)
+        if self._run is None and self._abandoned and not at_thing:  # something else moved the arm
+            self._abandoned = self._put_down = None
+        if self._run is None and self._achieved.number and not self._abandoned:
             return self._still(Idle("done", self._achieved.reason), self._achieved)
         try:
             return self._carry_out(planner, state, body, command, seen)
-        except GigabrainError as error:  # a thing that does not fit, or an arm without pads
+        except GigabrainError as error:  # the thing does not fit, or the arm has no pads
             return self._fail(str(error))
 
     def close(self) -> None:
-        """Stop the worker thread, after the plan that it makes."""
+        """Stop the worker thread, after its current plan."""
         self._display.close()
         self._pool.shutdown(cancel_futures=True)
 
-    def _ready(self, body: BodyDescription) -> ArmPlanner | None:
-        """Return the planner of the present body and model, once there is one."""
+    def _current_planner(self, body: BodyDescription) -> ArmPlanner | None:
+        """Return the planner for the current body and model; None until it is loaded.
+
+        Raises GigabrainError for a model that cannot be used, until there is another one.
+        """
         model = self._models.current
         if model is None:
             return None
-        wanted = model.mjcf, body
-        if wanted != self._made_for:
-            known = self._made_for
+        inputs = model.mjcf, body
+        if inputs != self._planner_inputs:
+            old = self._planner_inputs
             self._interrupt()
-            self._made_for, self._planner = wanted, None
-            if known is None or (known[0], known[1].joints) != (model.mjcf, body.joints):
-                self._left = None
+            self._planner_inputs, self._planner = inputs, None
+            if old is None or (old[0], old[1].joints) != (model.mjcf, body.joints):
+                self._abandoned = None
                 self._grip.release()
-            self._making = self._pool.submit(ArmPlanner, *wanted)
-        if self._planner is None and self._making and self._in_time(self._making, 0.0):
-            self._planner = self._making.result()  # raises as long as there is no other model
+            self._loading = self._pool.submit(ArmPlanner, *inputs)
+        if self._planner is None and self._loading and self._in_time(self._loading, 0.0):
+            self._planner = self._loading.result()
         return self._planner
 
     def _carry_out(
@@ -220,23 +224,23 @@ class Manipulator:
         if isinstance(do, Pick) and self._run is None and hold and hold.thing.name == do.thing:
             self._achieved = self._success(self._grip.text)
             return self._still(Idle("done", self._achieved.reason), self._achieved)
-        if hold and still_stands(seen, self._seen_as, state.tick - self._grip.firm_tick):
+        if hold and still_stands(seen, self._camera_id, state.tick - self._grip.firm_tick):
             self._grip.release()
             return self._fail(f"{hold.thing.name} is not in the gripper: it is seen where it was")
         if isinstance(do, AwaitTaken):
             return self._offer(planner, body, state)
-        if self._run is None and self._left and not hold:
-            self._back_off(planner, body, state, self._left)
+        if self._run is None and self._abandoned and not hold:
+            self._back_off(planner, body, state, self._abandoned)
         elif self._run is None:
             if self._planning is None:
-                held, floor = self._seen_as if hold else None, floor_of(body)
+                held, floor = self._camera_id if hold else None, floor_of(body)
                 things, numbers = located(command.things, seen, held, floor)
                 if self._put and (solid := self._put.at(state, seen)):
                     things[f"{self._put.name} put down"] = solid
                 else:
                     self._put = None
                 if isinstance(do, Pick) and not hold:
-                    self._seen_as = numbers.get(do.thing)
+                    self._camera_id = numbers.get(do.thing)
                 missing = None if hold else unseen(do, command.things, things)
                 if missing:
                     return self._look_for(missing, command, planner, state, body, things)
@@ -247,28 +251,28 @@ class Manipulator:
             if not self._in_time(self._planning, 0.0) or self._grip.moves:
                 return self._still(PLANNING)
             planning, self._planning = self._planning, None
-            return self._take_up(planning.result(), planner, state, body, command)
+            return self._start_plan(planning.result(), planner, state, body, command)
         return self._follow(planner, state, body, command)
 
-    def _take_up(
+    def _start_plan(
         self,
-        found: Planned,
+        planned: Planned,
         planner: ArmPlanner,
         state: RobotState,
         body: BodyDescription,
         command: ArmCommand,
     ) -> StepResult:
-        """Begin to carry out what was planned, unless it has to be planned again, or cannot be."""
-        if isinstance(found, NoWay):
-            if self._interim or self._put:  # it stays in sight, or less is in its way
-                self._interim, self._put = False, None
+        """Start to execute a plan; plan again if it is outdated, and fail if there is none."""
+        if isinstance(planned, NoWay):
+            if self._detour or self._put:  # try without moving aside, and without this obstacle
+                self._detour, self._put = False, None
                 return self._still(PLANNING)
-            return self._fail(found.reason, approach(self._target, found.stand_off))
-        if not begins_at(found, sent_posture(planner, body, state)):
-            self._interim = False
+            return self._fail(planned.reason, approach(self._target, planned.stand_off))
+        if not begins_at(planned, sent_posture(planner, body, state)):
+            self._detour = False
             return self._still(PLANNING)
-        self._left = None
-        self._begin(planner, found, state)
+        self._abandoned = None
+        self._begin(planner, planned, state)
         return self._follow(planner, state, body, command)
 
     def _look_for(
@@ -280,9 +284,9 @@ class Manipulator:
         body: BodyDescription,
         things: Mapping[str, Solid],
     ) -> StepResult:
-        """Hold still until a thing is seen, or begin to move the arm out of sight.
+        """Hold still until a thing is seen; then move the arm aside, as it may hide the thing.
 
-        A body that can drive looks for it elsewhere instead.
+        A body that can drive looks elsewhere for a thing with a label instead.
         """
         if not self._lookout.waits(state.tick):
             elsewhere = (command.things[name].label or "") if body.has_base else ""
@@ -292,7 +296,7 @@ class Manipulator:
             work = self._work(planner, state, body, TakePosture(posture), things)
             if isinstance(work, str):
                 return self._fail(work)
-            self._interim, self._planning = True, self._pool.submit(work)
+            self._detour, self._planning = True, self._pool.submit(work)
         return self._still(Idle("looking", f"looking for {name}"))
 
     def _work(
@@ -303,10 +307,11 @@ class Manipulator:
         do: ArmAction,
         things: Mapping[str, Solid],
     ) -> Callable[[], Planned] | str:
-        """Return what plans an action, or why it cannot be planned."""
+        """Return a function that plans an action, or why it cannot be planned."""
         if isinstance(do, Pick) and do.thing in things:
             self._target = thing_of(do.thing, things[do.thing])
-        drives = body.has_base and self._seen_as is not None  # others do not stay behind
+        # a thing that has its place from the mission moves along with the body
+        drives = body.has_base and self._camera_id is not None
         now = WorkInputs(
             state=state, body=body, things=things, hold=self._grip.hold, misses=self._misses,
             drives=drives,
@@ -314,7 +319,7 @@ class Manipulator:
         return work_for(planner, do, now)
 
     def _offer(self, planner: ArmPlanner, body: BodyDescription, state: RobotState) -> StepResult:
-        """Hold still until somebody pulls at what the gripper holds, or has taken it."""
+        """Hold still until a person pulls at the held thing, or takes it."""
         hold, self._touch = self._grip.hold, self._touch or Touch(planner)
         pulled = self._touch.is_pulled(body, state)
         if hold and holds(planner, hold, state) and not pulled:
@@ -327,8 +332,8 @@ class Manipulator:
     def _back_off(
         self, planner: ArmPlanner, body: BodyDescription, state: RobotState, left: Plan
     ) -> None:
-        """Begin to go back from a thing that is not held; afterwards it is planned again."""
-        self._left, self._interim = left, True
+        """Start to back off from a thing that is not held; afterwards the arm plans again."""
+        self._abandoned, self._detour = left, True
         posture, put_down = sent_posture(planner, body, state), left.phases[-1].name == "retreat"
         back = rest_of_place(left, posture) if put_down else planner.back_off(left, posture)
         self._begin(planner, back, state)
@@ -336,7 +341,7 @@ class Manipulator:
     def _press(
         self, planner: ArmPlanner, body: BodyDescription, state: RobotState, do: Press, over: bool
     ) -> StepResult:
-        """Go on to press, until it is felt enough or the way is `over`; then go back."""
+        """Continue to press until the force is reached or the way is `over`; then back off."""
         self._touch = self._touch or Touch(planner)
         pressure = self._touch.pressure(body, state)
         if over or (pressure and pressure.reaches(do.force)):
@@ -345,8 +350,8 @@ class Manipulator:
                 self._achieved = self._success(str(pressure))
                 self._results.append(self._achieved)
             else:
-                self._why_not = f"nothing was touched, {do.depth * 100:g} cm behind that place"
-            self._left, self._interim = self._plan, True
+                self._failure = f"nothing was touched, {do.depth * 100:g} cm behind that place"
+            self._abandoned, self._detour = self._plan, True
             posture = sent_posture(planner, body, state)
             back = planner.after_press(self._plan, posture, do.seconds if touched else 0.0)
             self._begin(planner, back, state)
@@ -362,7 +367,7 @@ class Manipulator:
     def _follow(
         self, planner: ArmPlanner, state: RobotState, body: BodyDescription, command: ArmCommand
     ) -> StepResult:
-        """Go on with the present plan by one step."""
+        """Execute one step of the current plan."""
         run, plan, hold = self._run, self._plan, self._grip.hold
         assert run
         if hold and run.phase and run.phase.name in CARRYING and not holds(planner, hold, state):
@@ -378,7 +383,7 @@ class Manipulator:
         if presses and isinstance(command.do, Press):
             return self._press(planner, body, state, command.do, over is not None)
         if over and over.name == "close" and plan.hold:
-            closed = sent_to(planner, body, state, plan.hold.grip)  # unless safety holds it back
+            closed = sent_to(planner, body, state, plan.hold.grip)  # False if safety holds it back
             if not (closed and holds(planner, plan.hold, state)):
                 return self._missed(planner, body, state)
             assert self._target
@@ -402,9 +407,9 @@ class Manipulator:
         return self._moving(state)
 
     def _missed(self, planner: ArmPlanner, body: BodyDescription, state: RobotState) -> StepResult:
-        """Go back from a thing that was not caught; afterwards another grasp is tried.
+        """Back off from a thing that was not caught; afterwards try another grasp.
 
-        A command that does not pick fails: what it moves was held before, and is lost.
+        A command that is not a pick fails: it has lost the thing that it moves.
         """
         lost = self._grip.hold
         self._grip.release()
@@ -416,7 +421,7 @@ class Manipulator:
         return self._moving(state)
 
     def _held_up(self, why: str) -> StepResult:
-        """Plan again from where the joints are, as something held them up."""
+        """Plan again from the current posture after a hold-up; fail after too many."""
         self._hold_ups += 1
         if self._hold_ups > HOLD_UPS:
             return self._fail(why)
@@ -424,7 +429,7 @@ class Manipulator:
         return self._still(PLANNING)
 
     def _let_go(self, state: RobotState) -> None:
-        """Record that what was held has been put down, maybe by an earlier command."""
+        """Record that the held thing was put down, maybe by an earlier command."""
         done, self._put_down = self._put_down, None
         assert done
         assert done.placed
@@ -432,7 +437,7 @@ class Manipulator:
         self._results.append(done)
         if done.number == self._number:
             self._achieved = done
-        if self._seen_as is not None:  # others have a place by their mission
+        if self._camera_id is not None:  # other things have a place in the mission
             self._put = PutDown(name=done.placed[0], solid=done.placed[1], state=state)
 
     def _success(self, reason: str = "", placed: tuple[str, Solid] | None = None) -> StepOutcome:
@@ -447,15 +452,15 @@ class Manipulator:
     def _end(
         self, body: BodyDescription, state: RobotState, run: PhaseRun, do: ArmAction
     ) -> StepResult:
-        """End a command whose phases are over, once the joints are where they should be."""
+        """End a command after its last phase, once the joints are within their tolerances."""
         assert body.arm
         last = self._plan.phases[-1].arm
         end = dict(zip(last.names, last.positions[-1].tolist(), strict=True)) if last else {}
         if off := off_from(body, state, end, "goal_tolerance"):
             late = run.over_for(state.tick) * TICK_S > body.arm.goal_time
             return self._held_up(off) if late else self._moving(state)
-        if self._interim and not self._achieved.number:
-            why = self._why_not or (MISSED if self._misses >= TRIES else "")
+        if self._detour and not self._achieved.number:
+            why = self._failure or (MISSED if self._misses >= TRIES else "")
             self._drop()
             return self._fail(why) if why else self._still(PLANNING)
         if not self._achieved.number:
@@ -485,14 +490,14 @@ class Manipulator:
         return intent, replace(outcome, number=self._number)
 
     def _interrupt(self) -> None:
-        """Forget the plan, but not that the hand may be at its thing; see `is_at`."""
-        left = self._left or (self._plan if self._run else None)
+        """Drop the plan, but remember that the hand may be at its thing; see `is_at`."""
+        left = self._abandoned or (self._plan if self._run else None)
         self._drop()
-        self._left = left
+        self._abandoned = left
 
     def _drop(self) -> None:
-        """Forget the plan, and the one that is being made."""
+        """Drop the current plan, and the one in the making."""
         if self._planning:
             self._planning.cancel()
-        self._planning = self._run = self._left = self._touch = None
-        self._interim, self._why_not = False, ""
+        self._planning = self._run = self._abandoned = self._touch = None
+        self._detour, self._failure = False, ""

@@ -1,4 +1,4 @@
-"""Things that a camera sees near the arm, and which of them a mission means."""
+"""Things that cameras see near the arm, matched with the things of a mission."""
 
 import math
 from collections import deque
@@ -20,13 +20,13 @@ from gigabrain_zenoh.geometry.pose import PoseHistory, relative, to_parent
 if TYPE_CHECKING:
     from gigabrain_zenoh.manipulation.collision import Thing  # imports MuJoCo
 
-LIKE_M, LIKE_SHARE = 0.006, 0.3  # by which lengths may differ of what is taken for a thing
-SAME_M = 0.03  # beside where a thing stands by its mission: it is the same, seen
-SEEN_AFTER_TICKS = 50  # since a thing is held: a camera that still sees it stand is right
-NEAR_M = 1.0  # of the body, within which what is seen may be in the arm's way
-LOOK_TICKS = 75  # at rest, until a thing in sight is known: pictures come five times a second
-PUT_M, PUT_TICKS = 0.06, 500  # beside where a thing was put down, and until a camera has seen it
-ASIDE = 0.7  # of the first joint's range, to either side, where the arm hides nothing
+SIZE_TOLERANCE_M, SIZE_TOLERANCE = 0.006, 0.3  # length and share; the larger one counts
+SAME_M = 0.03  # between a thing with a place and a seen one that is the same
+SEEN_AFTER_TICKS = 50  # after a grip; if the thing is seen standing later, it is not held
+NEAR_M = 1.0  # from the body, reach in which seen things are obstacles of the arm
+LOOK_TICKS = 75  # wait at rest for a thing to be seen; pictures arrive at 5 Hz
+PUT_M, PUT_TICKS = 0.06, 500  # distance and time in which a camera confirms a thing put down
+ASIDE = 0.7  # share of the first joint's limits, postures in which the arm hides nothing
 Lengths = tuple[float, float, float]
 
 
@@ -37,91 +37,96 @@ class SeenThings:
         self._bus = bus
         self._received: deque[Solids] = deque(maxlen=2)
         self._history = PoseHistory()
-        self._watches = False
+        self._subscribed = False
 
     def observe(self, body: BodyDescription | None, state: RobotState) -> None:
         """Record the odometry; subscribe once the body is known to have an arm and a camera."""
         self._history = self._history.then(state)
-        if body and body.arm and body.cameras and not self._watches:
-            self._watches = True
+        if body and body.arm and body.cameras and not self._subscribed:
+            self._subscribed = True
             self._bus.latest(SOLIDS, self._received.append)
 
     def at(self, state: RobotState) -> tuple[SeenSolid, ...]:
-        """Return what was seen before a state, in the body's frame then; the nearest first.
+        """Return the things seen before `state`, in the body's frame at `state`, nearest first.
 
-        It is what a replay of the same messages finds.
+        A replay of the same messages returns the same things.
         """
         boot, tick = state.boot, state.tick
-        earlier = (one for one in reversed(self._received) if one.boot == boot and one.tick < tick)
+        earlier = (
+            message
+            for message in reversed(self._received)
+            if message.boot == boot and message.tick < tick
+        )
         newest = next(earlier, None)
-        then = self._history.at(boot, newest.basis) if newest else None
-        if newest is None or then is None:
+        old_pose = self._history.at(boot, newest.basis) if newest else None
+        if newest is None or old_pose is None:
             return ()
-        here, older = relative(state.pose, then), (tick - newest.basis) * TICK_S
+        motion, age_s = relative(state.pose, old_pose), (tick - newest.basis) * TICK_S
         moved = []
-        for one in newest.solids:
-            x, y = to_parent(here, *one.position[:2])
-            place, yaw = (x, y, one.position[2]), one.yaw + here.yaw
-            moved.append(replace(one, position=place, yaw=yaw, age=one.age + older))
-        return tuple(sorted(moved, key=lambda one: math.hypot(*one.position[:2])))
+        for solid in newest.solids:
+            x, y = to_parent(motion, *solid.position[:2])
+            place, yaw = (x, y, solid.position[2]), solid.yaw + motion.yaw
+            moved.append(replace(solid, position=place, yaw=yaw, age=solid.age + age_s))
+        return tuple(sorted(moved, key=lambda solid: math.hypot(*solid.position[:2])))
 
 
 @dataclass(frozen=True, kw_only=True)
 class PutDown:
-    """A thing that the arm has put down: it is in the way, even if the arm hides it."""
+    """A thing that the arm put down: it is an obstacle, even if the arm hides it from cameras."""
 
     name: str
-    solid: Solid  # with its place in the body's frame then
-    state: RobotState
+    solid: Solid  # placed in the body's frame at `state`
+    state: RobotState  # when it was put down
 
     def at(self, state: RobotState, seen: tuple[SeenSolid, ...]) -> Solid | None:
-        """Return it in the body's frame now, until something is seen there or the body drives off.
+        """Return the solid in the body's current frame; None once it can be forgotten.
 
-        Forget it after ten seconds as well, in case someone took it before the camera saw it.
+        That is when something is seen there, when the body drives off, or after PUT_TICKS, as a
+        person may take the thing before a camera sees it.
         """
         assert self.solid.at
-        here = relative(state.pose, self.state.pose)
-        x, y = to_parent(here, *self.solid.at[:2])
+        motion = relative(state.pose, self.state.pose)
+        x, y = to_parent(motion, *self.solid.at[:2])
         old = not 0 <= state.tick - self.state.tick < PUT_TICKS or state.boot != self.state.boot
         if old or math.hypot(x, y) > NEAR_M:
             return None
-        if any(math.dist((x, y), one.position[:2]) < PUT_M for one in seen):
+        if any(math.dist((x, y), other.position[:2]) < PUT_M for other in seen):
             return None
-        return replace(self.solid, at=(x, y, self.solid.at[2]), yaw=self.solid.yaw + here.yaw)
+        return replace(self.solid, at=(x, y, self.solid.at[2]), yaw=self.solid.yaw + motion.yaw)
 
 
 class Lookout:
-    """Waits for a thing to be seen, and names postures to look for it from."""
+    """Waits for a thing to be seen, and moves the arm aside so that it does not hide the thing."""
 
     def __init__(self) -> None:
-        self._since: int | None = None
-        self._gone = 0  # of the postures
+        self._since_tick: int | None = None
+        self._tried = 0  # number of postures
 
     def reset(self) -> None:
-        """Begin with another command, or once the thing is seen."""
-        self._since, self._gone = None, 0
+        """Start again, for another command."""
+        self._since_tick, self._tried = None, 0
 
     def waits(self, tick: int) -> bool:
-        """Return whether it may still come to be seen from where the arm rests."""
-        if self._since is None or tick < self._since:
-            self._since = tick
-        return tick - self._since < LOOK_TICKS
+        """Return whether the thing may still be seen from the current posture."""
+        if self._since_tick is None or tick < self._since_tick:
+            self._since_tick = tick
+        return tick - self._since_tick < LOOK_TICKS
 
     def aside(self, body: BodyDescription) -> dict[str, float] | None:
-        """Return the next posture to look from [rad] or [m]; None after the last one."""
+        """Return the next posture to try [rad] or [m]; None after the last one."""
         assert body.arm
-        first, places = body.joints[0], dict[str, float]()
-        postures = [None, first.lower * ASIDE, first.upper * ASIDE]
-        if self._gone >= len(postures):
+        first, posture = body.joints[0], dict[str, float]()
+        turns = [None, first.lower * ASIDE, first.upper * ASIDE]
+        if self._tried >= len(turns):
             return None
-        for joint, place in zip(body.joints, body.arm.home, strict=True):
+        for joint, position in zip(body.joints, body.arm.home, strict=True):
             if joint.part == "arm":
-                places[joint.name] = place
-        if (aside := postures[self._gone]) is not None:
-            places[first.name] = aside
-        self._gone += 1
-        self._since = None
-        return places
+                posture[joint.name] = position
+        if (turn := turns[self._tried]) is not None:
+            posture[first.name] = turn
+        self._tried += 1
+        self._since_tick = None
+        return posture
 
 
 def located(
@@ -130,42 +135,43 @@ def located(
     held: int | None = None,
     floor: float = 0.0,
 ) -> tuple[dict[str, Solid], dict[str, int]]:
-    """Return where things are, those without a place by what is seen; without what is not seen.
+    """Return all known solids by name, and the numbers of those that were found in `seen`.
 
-    All else that is seen nearby is in the way, by the name `seen` with its number. What the gripper
-    has `held` since it was seen with that number stands there no more. Heights are seen from the
-    floor, which is at `floor` [m] in the frame of the arm's model. The second result has the
-    numbers of things that are where they are seen.
+    A thing without a place gets that of the first seen solid that fits, and is left out if there is
+    none. Other seen solids nearby are obstacles, named `seen` with their number. The seen solid
+    with the number `held` is in the gripper now, so it is left out. Seen heights are above the
+    floor, which is at `floor` [m] in the frame of the arm's model.
     """
-    given = {name: one for name, one in things.items() if one.at}
-    left = [one for one in seen if one.id != held]
-    left = [one for one in left if not any(_stands(one, other) for other in given.values())]
+    given = {name: thing for name, thing in things.items() if thing.at}
+    rest = [solid for solid in seen if solid.id != held]
+    rest = [solid for solid in rest if not any(_is_at(solid, thing) for thing in given.values())]
     found: dict[str, Solid] = {}
     numbers: dict[str, int] = {}
-    for name, wanted in things.items():
-        if wanted.at is None and (one := next((one for one in left if _fits(wanted, one)), None)):
-            left.remove(one)
-            found[name], numbers[name] = _placed(wanted, one), one.id
-    for one in left:
-        if math.hypot(*one.position[:2]) < NEAR_M:
-            found[f"seen {one.id}"] = _as_seen(one)
-    return given | {name: _raised(one, floor) for name, one in found.items()}, numbers
+    for name, thing in things.items():
+        match = next((solid for solid in rest if _fits(thing, solid)), None)
+        if thing.at is None and match:
+            rest.remove(match)
+            found[name], numbers[name] = _placed(thing, match), match.id
+    for solid in rest:
+        if math.hypot(*solid.position[:2]) < NEAR_M:
+            found[f"seen {solid.id}"] = _as_seen(solid)
+    return given | {name: _raised(solid, floor) for name, solid in found.items()}, numbers
 
 
 def unseen(do: ArmAction, things: Mapping[str, Solid], known: Mapping[str, Solid]) -> str | None:
-    """Return the name of the thing that an action needs, if it is one that is not `known`."""
+    """Return the name of the thing that an action needs, if it is not `known`; else None."""
     thing = thing_meant(do)
     return None if thing in known or thing not in things else thing
 
 
 def still_stands(seen: tuple[SeenSolid, ...], number: int | None, held_ticks: int) -> bool:
-    """Return whether what is held for so long was seen standing since, by its number."""
+    """Return whether cameras saw the thing `number` standing, although it counts as held."""
     since_s = (held_ticks - SEEN_AFTER_TICKS) * TICK_S
-    return any(one.id == number and one.age < since_s for one in seen)
+    return any(solid.id == number and solid.age < since_s for solid in seen)
 
 
 def approach(thing: "Thing | None", stand_off: float | None) -> Target | None:
-    """Return a thing that the body should stand so far from [m], in the body's frame."""
+    """Return a target for the body, `stand_off` [m] from a thing, in the body's frame."""
     if thing is None or stand_off is None:
         return None
     x, y, _ = thing.position.tolist()
@@ -173,23 +179,23 @@ def approach(thing: "Thing | None", stand_off: float | None) -> Target | None:
     return Target(name=thing.name, x=x, y=y, radius=radius, away=stand_off)
 
 
-def _stands(one: SeenSolid, other: Solid) -> bool:
-    return other.at is not None and math.dist(one.position[:2], other.at[:2]) < SAME_M
+def _is_at(seen: SeenSolid, thing: Solid) -> bool:
+    return thing.at is not None and math.dist(seen.position[:2], thing.at[:2]) < SAME_M
 
 
-def _fits(wanted: Solid, one: SeenSolid) -> bool:
-    """Return whether what is seen has the wanted class, and about the wanted size."""
-    if wanted.label and wanted.label != one.label:
+def _fits(wanted: Solid, seen: SeenSolid) -> bool:
+    """Return whether a seen solid has the wanted class, and about the wanted size."""
+    if wanted.label and wanted.label != seen.label:
         return False
     lengths = _lengths(wanted)
     if lengths is None:
         return True
-    pairs = zip(_by_size(lengths), _by_size(_seen_lengths(one)), strict=True)
-    return all(abs(a - b) <= max(LIKE_M, LIKE_SHARE * a) for a, b in pairs)
+    pairs = zip(_by_size(lengths), _by_size(_seen_lengths(seen)), strict=True)
+    return all(abs(a - b) <= max(SIZE_TOLERANCE_M, SIZE_TOLERANCE * a) for a, b in pairs)
 
 
 def _by_size(lengths: Lengths) -> Lengths:
-    """Return lengths with the shorter side first; the height stays the last."""
+    """Return lengths with the shorter side first, and the height last."""
     x, y, z = lengths
     return min(x, y), max(x, y), z
 
@@ -203,28 +209,28 @@ def _lengths(solid: Solid) -> Lengths | None:
     return (2 * solid.sphere,) * 3 if solid.sphere else None
 
 
-def _seen_lengths(one: SeenSolid) -> Lengths:
-    if one.shape == "box":
-        x, y, z = one.size
+def _seen_lengths(seen: SeenSolid) -> Lengths:
+    if seen.shape == "box":
+        x, y, z = seen.size
         return x, y, z
-    wide = 2 * one.size[0]
-    return wide, wide, one.size[1] if one.shape == "cylinder" else wide
+    diameter = 2 * seen.size[0]
+    return diameter, diameter, seen.size[1] if seen.shape == "cylinder" else diameter
 
 
-def _as_seen(one: SeenSolid) -> Solid:
-    shape = {one.shape: one.size if len(one.size) > 1 else one.size[0]}
-    return Solid(**shape, at=one.position, yaw=one.yaw)  # type: ignore[arg-type]
+def _as_seen(seen: SeenSolid) -> Solid:
+    shape = {seen.shape: seen.size if len(seen.size) > 1 else seen.size[0]}
+    return Solid(**shape, at=seen.position, yaw=seen.yaw)  # type: ignore[arg-type]
 
 
-def _placed(wanted: Solid, one: SeenSolid) -> Solid:
-    """Return a thing where it is seen, by its own lengths where they are given."""
+def _placed(wanted: Solid, seen: SeenSolid) -> Solid:
+    """Return a wanted thing at the place of a seen solid, with its own lengths if given."""
     lengths = _lengths(wanted)
     if lengths is None:
-        return _as_seen(one)
-    x, y, _ = one.position
-    long, wide, _ = _seen_lengths(one)
-    turned = (long - wide) * (lengths[0] - lengths[1]) < 0.0  # its longer side is the other one
-    yaw = one.yaw + (math.pi / 2 if turned else 0.0)
+        return _as_seen(seen)
+    x, y, _ = seen.position
+    seen_x, seen_y, _ = _seen_lengths(seen)
+    turned = (seen_x - seen_y) * (lengths[0] - lengths[1]) < 0.0  # the longer sides are swapped
+    yaw = seen.yaw + (math.pi / 2 if turned else 0.0)
     return replace(wanted, at=(x, y, lengths[2] / 2), yaw=yaw, label=None)
 
 
