@@ -1,4 +1,4 @@
-"""Steps of a mission that move an arm, and the things round it. All is in its base's frame."""
+"""Steps of a mission that move an arm, and the things around it, in the frame of its base."""
 
 from collections.abc import Iterable, Sequence
 from importlib.util import find_spec
@@ -16,7 +16,7 @@ NEEDED = ("mujoco", "ruckig", "numba")  # packages of the extra `arm`
 Metres = Annotated[float, Meta(ge=-10.0, le=10.0)]
 Side = Annotated[float, Meta(ge=0.001, le=10.0)]  # [m]
 Point3 = tuple[Metres, Metres, Metres]  # x, y, z [m]
-# msgspec 0.22 crashes where a tuple of a fixed length may be a text with limits instead
+# msgspec 0.22 crashes for a union of a fixed-length tuple and a constrained str
 PointOrThing = Annotated[tuple[Metres, ...], Meta(min_length=3, max_length=3)] | Name
 Spot = Annotated[tuple[Metres, ...], Meta(min_length=2, max_length=3)]  # x, y, and maybe z [m]
 JointPlace = Annotated[float, Meta(ge=-100.0, le=100.0)]  # [rad] or [m]
@@ -32,20 +32,20 @@ Patience = Annotated[float, Meta(gt=0.0, le=1e5)]  # [s]
 
 
 class Solid(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_defaults=True):
-    """A thing that can be picked up, or that is in the way: of one shape, or of a class.
+    """A thing to pick up or to avoid, with one shape, or with a class.
 
-    Without a place it is where a camera sees it.
+    A thing without a place is located by cameras.
     """
 
     box: tuple[Side, Side, Side] | None = None  # [m], lengths along its x, y and z
     cylinder: tuple[Side, Side] | None = None  # [m], radius, and length along z
     sphere: Side | None = None  # [m], radius
-    label: Label | None = None  # its class, as a camera recognises it
-    at: Point3 | None = None  # of its middle
+    label: Label | None = None  # class that cameras recognise
+    at: Point3 | None = None  # of its centre
     yaw: Angle = 0.0  # [rad]
 
     def __post_init__(self) -> None:
-        shapes = sum(one is not None for one in (self.box, self.cylinder, self.sphere))
+        shapes = sum(shape is not None for shape in (self.box, self.cylinder, self.sphere))
         if shapes > 1 or not (shapes or self.label):
             raise ValueError("expected a box, a cylinder or a sphere, or a label that is seen")
         if self.label and self.at:
@@ -58,11 +58,11 @@ class HeldThing(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     name: Name
     solid: Solid  # in the frame of the tool
     axes: Rotation  # of the thing in that frame, row by row
-    grip: JointPlace  # [rad] or [m], where the gripper's joint was sent
-    opening: JointPlace  # [rad] or [m], where it goes to let go
+    grip: JointPlace  # [rad] or [m], command of the gripper's joint
+    opening: JointPlace  # [rad] or [m], position that lets go
 
 
-Held = HeldThing | JointPlace  # or something unknown, and where the gripper was sent to hold it
+Held = HeldThing | JointPlace  # JointPlace: the gripper's command that holds something unknown
 
 
 class Reach(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_defaults=True):
@@ -79,43 +79,43 @@ class TakePosture(Struct, frozen=True):
 
 
 class Gripper(Struct, frozen=True):
-    """Move the gripper alone."""
+    """Move only the gripper."""
 
     to: GripperPlace
 
 
 class Pick(Struct, frozen=True):
-    """Pick a thing up."""
+    """Pick up a thing."""
 
     thing: str
 
 
 class PlaceThing(Struct, frozen=True):
-    """Put down what is held, its middle at a point; without a height, on the floor."""
+    """Put down the held thing with its centre at a point; without a height, on the floor."""
 
     at: Spot
 
 
 class Press(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_defaults=True):
-    """Press a place with the closed tool, or the near side of a thing, until it is felt enough."""
+    """Press a point, or the near side of a thing, with the closed tool until a force is felt."""
 
     at: PointOrThing  # x, y, z [m], or one of the mission's `things`
     pitch: Angle | None = None  # [rad] down from level; None: any way
-    depth: Depth = 0.03  # [m] behind the place, at most
-    force: PressForce = 4.0  # [N] at which it is pressed
-    seconds: HoldTime = 0.5  # for which it is held so
+    depth: Depth = 0.03  # [m], maximum, behind the point
+    force: PressForce = 4.0  # [N]
+    seconds: HoldTime = 0.5  # time to keep the force
 
 
 class HandOver(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_defaults=True):
-    """Hold a thing out to a person; open the gripper when the person pulls or says so."""
+    """Hold out a thing to a person; open the gripper when the person pulls or confirms."""
 
-    at: Point3 | None = None  # [m], of the tool; None: well ahead, and high
+    at: Point3 | None = None  # [m], of the tool; None: far ahead and high
     pitch: Angle | None = None  # [rad] down from level; None: any way
-    seconds: Patience = 60.0  # for which it waits
+    seconds: Patience = 60.0  # time limit
 
 
 class AwaitTaken(Struct, frozen=True):
-    """Hold still until a person pulls at the thing, or has taken it."""
+    """Hold still until a person pulls at the held thing, or takes it."""
 
 
 ArmAction = Reach | TakePosture | Gripper | Pick | PlaceThing | Press | HandOver | AwaitTaken
@@ -143,14 +143,14 @@ def action_of(kind: str, value: Any) -> ArmAction | None:
 
 
 def thing_meant(action: ArmAction | None) -> str | None:
-    """Return the name of the thing that an action needs to know; None for none."""
+    """Return the name of the thing that an action uses; None if it uses none."""
     if isinstance(action, Pick):
         return action.thing
     return action.at if isinstance(action, Press) and isinstance(action.at, str) else None
 
 
 def describe(action: ArmAction) -> str:
-    """Return what the arm does, for people."""
+    """Return an action of the arm as text for users."""
     match action:
         case Reach(at=at):
             return f"reaching for {describe_point(at)}"
@@ -174,7 +174,7 @@ def describe(action: ArmAction) -> str:
 
 def describe_point(point: Sequence[float]) -> str:
     """Return a point as text [m]."""
-    return f"({', '.join(f'{one:.3f}' for one in point)})"
+    return f"({', '.join(f'{value:.3f}' for value in point)})"
 
 
 def check(
@@ -186,7 +186,8 @@ def check(
     for package in NEEDED:
         if find_spec(package) is None:
             raise Refused(f"moving an arm needs {package}; pip install 'gigabrain-zenoh[arm]'")
-    if any(thing.at is None for thing in things) and not any(one.depth for one in body.cameras):
+    has_depth = any(camera.depth for camera in body.cameras)
+    if any(thing.at is None for thing in things) and not has_depth:
         raise Refused(
             "things without a place have to be seen, and the robot has no depth camera; "
             "start it with --cameras, or `cameras: on`"

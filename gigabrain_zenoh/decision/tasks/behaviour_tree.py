@@ -1,4 +1,4 @@
-"""Behaviour trees of missions: own nodes for py-trees, the builder, and their progress on disk.
+"""Behaviour trees of missions: own py-trees nodes, the builder, and the saved progress.
 
 All nodes use the robot's time.
 """
@@ -35,16 +35,16 @@ from gigabrain_zenoh.decision.tasks.mission import (
 )
 
 FOREVER = -1  # for py-trees
-AWAY_S = 1.5  # for a person to take the hand away, after the gripper has opened
+HAND_AWAY_S = 1.5  # for a person to withdraw the hand, once the gripper is open
 Index = Annotated[float, Meta(ge=0, le=1e9)]
-Progress = dict[str, Index]  # of each running node, by its number in depth-first order
+Progress = dict[str, Index]  # state of each running node, by its number in depth-first order
 
 
 class _TimeoutNode(Decorator):
-    """Fails if its child takes longer than some seconds of the robot's time.
+    """Fails if its child takes longer than `seconds` of the robot's time.
 
-    The clock stops while the gate or an operator holds the body, and while a guard runs its `then`
-    instead.
+    The timer stops while the gate or an operator holds the body, and while a guard around it runs
+    its `then`.
     """
 
     def __init__(self, child: Behaviour, seconds: float, context: MissionContext) -> None:
@@ -55,12 +55,12 @@ class _TimeoutNode(Decorator):
         self.began_s = self._context.free_s
 
     def delay(self, seconds: float) -> None:
-        """Leave out `seconds` of the time that has passed."""
+        """Exclude `seconds` of the elapsed time."""
         self.began_s += seconds
 
     def update(self) -> Status:
-        too_long = self._context.free_s - self.began_s > self._seconds
-        if self.decorated.status is Status.RUNNING and too_long:
+        timed_out = self._context.free_s - self.began_s > self._seconds
+        if self.decorated.status is Status.RUNNING and timed_out:
             outcome = self._context.outcome
             why = f": {outcome.reason}" if outcome and outcome.reason else ""
             problem = f"{self._context.doing}: not done within {self._seconds:g} s"
@@ -71,7 +71,7 @@ class _TimeoutNode(Decorator):
 
 
 class _GuardNode(Behaviour):
-    """Ticks `then` to its end whenever a condition holds, otherwise `do`, which then continues."""
+    """Ticks `do`; whenever a condition holds, ticks `then` to its end first."""
 
     def __init__(
         self, condition: Condition, then: Behaviour, do: Behaviour, context: MissionContext
@@ -104,7 +104,7 @@ class _GuardNode(Behaviour):
         return self.status  # of the last `tick`
 
     def _delay(self) -> None:
-        """Stop the clocks of `do` for the present tick."""
+        """Stop the timers in `do` for the current tick."""
         for node in _nodes(self._do):
             if isinstance(node, _TimeoutNode | OfferNode):
                 node.delay(self._context.passed_s)
@@ -207,7 +207,7 @@ class TreeBuilder:
             ArmNode(do, context),
             OfferNode(do.seconds, context),
             ArmNode(Gripper("open"), context),
-            WaitNode(AWAY_S, context),
+            WaitNode(HAND_AWAY_S, context),
             ArmNode(TakePosture("home"), context),
         ]
         return Sequence("hand over", memory=True, children=children)
@@ -232,7 +232,7 @@ def _repeated(child: Behaviour, times: int | None) -> Behaviour:
 
 
 def progress_of(root: Behaviour, free_s: float) -> Progress:
-    """Return how far the running nodes below `root` have come; leaves have no progress."""
+    """Return the progress of the running nodes below `root`; leaves have none."""
     progress: Progress = {}
     for number, node in enumerate(_nodes(root)):
         if node.status is not Status.RUNNING:
@@ -251,7 +251,7 @@ def progress_of(root: Behaviour, free_s: float) -> Progress:
 
 
 def restore(root: Behaviour, progress: Progress) -> None:
-    """Let the nodes below `root` continue from `progress`; leaves start again."""
+    """Restore the nodes below `root` from `progress`; leaves start again."""
     for number, node in enumerate(_nodes(root)):
         if str(number) not in progress:
             continue

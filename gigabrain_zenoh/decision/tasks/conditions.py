@@ -15,7 +15,7 @@ from gigabrain_schemas.topics import STATE, TOPICS, Topic
 from gigabrain_zenoh.errors import unknown
 
 Value = float | str | bool
-Read = Callable[[Topic[Any]], Message | None]  # returns the newest message while it is fresh
+Read = Callable[[Topic[Any]], Message | None]  # returns the newest message if it is fresh
 
 OPERATORS: Mapping[str, Callable[[Any, Any], bool]] = {
     "<": operator.lt,
@@ -41,38 +41,38 @@ class Condition(msgspec.Struct, frozen=True):
 
     def holds(self, read: Read) -> bool | None:
         """Return whether the condition holds; None while the value is unknown."""
-        here: Any = read(self.topic)
+        value: Any = read(self.topic)
         for part in self.path:
-            if isinstance(here, tuple):
-                here = here[int(part)] if int(part) < len(here) else None
-            elif here is not None:
-                here = getattr(here, part)
-        return None if here is None else OPERATORS[self.operator](here, self.value)
+            if isinstance(value, tuple):
+                value = value[int(part)] if int(part) < len(value) else None
+            elif value is not None:
+                value = getattr(value, part)
+        return None if value is None else OPERATORS[self.operator](value, self.value)
 
 
 def parse(text: str) -> Condition:
-    """Return the condition in a text. Raises ValueError that names what was expected."""
-    found = FORM.fullmatch(text)
-    if not found:
+    """Return the condition in a text. Raises ValueError with the expected form."""
+    match = FORM.fullmatch(text)
+    if not match:
         raise ValueError(f"{EXPECTED}, got {text!r}")
-    field, sign, literal = found.groups()
-    topic, path = _place(field)
+    field, sign, literal = match.groups()
+    topic, path = _topic_and_path(field)
     type_ = _type(topic.type, path, field)
-    words = typing.get_args(type_)  # that it may be; none for any
+    words = typing.get_args(type_)  # allowed ones; empty if it is no Literal
     kind = str if words else type_
     value = _value(literal)
-    wanted: tuple[type, ...] = (bool,) if kind is bool else (str,) if kind is str else (int, float)
-    if not isinstance(value, wanted) or (isinstance(value, bool) and kind is not bool):
-        raise ValueError(f"{field} is {_named(kind)}; it cannot be compared with {literal!r}")
+    types_: tuple[type, ...] = (bool,) if kind is bool else (str,) if kind is str else (int, float)
+    if not isinstance(value, types_) or (isinstance(value, bool) and kind is not bool):
+        raise ValueError(f"{field} is {_type_name(kind)}; it cannot be compared with {literal!r}")
     if kind in (bool, str) and sign not in ("==", "!="):
-        raise ValueError(f"{field} is {_named(kind)}; expected == or !=, got {sign}")
+        raise ValueError(f"{field} is {_type_name(kind)}; expected == or !=, got {sign}")
     if words and value not in words:
         raise ValueError(f"{field}: {unknown('word', literal, words)}")
     return Condition(topic, path, sign, value, " ".join(text.split()))
 
 
-def _place(field: str) -> tuple[Topic[Any], tuple[str, ...]]:
-    """Return the topic and the path of a field in it; without a topic's name, `robot/state`."""
+def _topic_and_path(field: str) -> tuple[Topic[Any], tuple[str, ...]]:
+    """Return the topic of a field, and its path there; without a topic's name, of `robot/state`."""
     first, *rest = field.split(".")
     known = {topic.key.removeprefix("robot/"): topic for topic in TOPICS if not topic.many}
     if first in known and rest:
@@ -115,8 +115,8 @@ def _bare(type_: Any) -> Any:
 
 
 def _max_length(type_: Any) -> int:
-    """Return the bound of a tuple's length: each field of a message has one."""
-    meta = next(one for one in typing.get_args(type_) if isinstance(one, msgspec.Meta))
+    """Return the maximum length of a tuple: each field of a message has one."""
+    meta = next(arg for arg in typing.get_args(type_) if isinstance(arg, msgspec.Meta))
     assert meta.max_length is not None
     return meta.max_length
 
@@ -128,8 +128,8 @@ def _value(literal: str) -> Value:
         value = float(literal)
     except ValueError:
         return literal
-    return value if value - value == 0.0 else literal  # nan and inf are words here
+    return value if value - value == 0.0 else literal  # `nan` and `inf` are words
 
 
-def _named(kind: type) -> str:
+def _type_name(kind: type) -> str:
     return "true or false" if kind is bool else "a word" if kind is str else "a number"

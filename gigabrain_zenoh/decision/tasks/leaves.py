@@ -1,4 +1,4 @@
-"""Leaves of mission trees, for py-trees: they drive, move the arm, wait, check, or run a program.
+"""Leaves of mission trees for py-trees: drive, move the arm, wait, check, or run a program.
 
 All use the robot's time.
 """
@@ -35,21 +35,21 @@ from gigabrain_zenoh.decision.tasks.conditions import Condition, Read
 from gigabrain_zenoh.decision.tasks.mission import Script
 from gigabrain_zenoh.decision.tasks.scripts import Run, RunningScripts
 
-MOVED_M = 0.15  # that a target may be off where the robot drives to
-LEFT_M = 0.4  # round where a thing was not known any more: it does not go there again without it
-FIRST_MESSAGE_S = 1.0  # for which a check waits for a message of its topic
-MAX_WAYS = 4  # to a thing that is to be picked up
+TARGET_MOVED_M = 0.15  # a target that moved farther needs another command
+TRIED_M = 0.4  # radius of a place that was reached in vain: an unknown target is not sought there
+FIRST_MESSAGE_S = 1.0  # a check waits so long for the first message of its topic
+MAX_APPROACHES = 4  # of a thing to pick up
 NOBODY_LOOKS = "waiting: nothing is recognised in pictures; run the process `recognition`"
 
 
 def seek_nothing(_wanted: Wanted, _without: Collection[int], _preferred: int | None) -> Sought:
-    """Return that nothing is known."""
+    """Find nothing."""
     return Sought()
 
 
 @dataclass
 class Hand:
-    """Holds what the gripper is believed to hold, over all tasks."""
+    """What the gripper is believed to hold; shared by all tasks."""
 
     held: Held | None = None
 
@@ -60,30 +60,30 @@ class MissionContext:
 
     read: Read
     scripts: RunningScripts
-    numbers: Iterator[int]  # of commands, each only once
+    numbers: Iterator[int]  # unique numbers for commands
     seek: Seek = seek_nothing
     hand: Hand = field(default_factory=Hand)
     now_s: float = 0.0
-    held_s: float = 0.0  # of that, while the body did not follow a command
-    passed_s: float = 0.0  # in this tick, unless the body was held
+    held_s: float = 0.0  # part of `now_s` in which the body did not follow a command
+    passed_s: float = 0.0  # since the last tick; 0 while the body is held
     outcome: StepOutcome | None = None  # of the command of the last tick
     command: Command | None = None  # of the active node
     given: Mapping[str, Solid] = field(default_factory=dict)  # things of the mission's file
-    things: dict[str, Solid] = field(default_factory=dict)  # what stands round the arm by now
+    things: dict[str, Solid] = field(default_factory=dict)  # now around the arm
     offers: bool = False  # the active step waits for a person to take something
-    may_let_go: bool = False  # a person has said that it may let go
-    doing: str = ""  # the active step, for people
-    problem: str = ""  # the last failure, for people
+    may_let_go: bool = False  # a person confirmed that the gripper may open
+    doing: str = ""  # the active step, shown to users
+    problem: str = ""  # the last failure, shown to users
     progress: float | None = None  # of a step that does not drive
-    left_s: float | None = None  # until such a step is done, if known
+    left_s: float | None = None  # time left of such a step, if known
 
     @property
     def free_s(self) -> float:
-        """Time that the mission has run while nothing held the body [s]."""
+        """Running time of the mission without the time in which the body was held [s]."""
         return self.now_s - self.held_s
 
     def begin(self, seconds: float, outcome: StepOutcome | None) -> None:
-        """Begin the next tick, `seconds` after the last."""
+        """Begin the next tick, `seconds` after the last one."""
         held = outcome is not None and outcome.held
         self.now_s += seconds
         self.held_s += seconds if held else 0.0
@@ -139,7 +139,7 @@ class DriveNode(Leaf):
 
 
 class ArmNode(Leaf):
-    """Issues a command to the arm, ends with its outcome, and records where things are then."""
+    """Issues a command to the arm, ends with its outcome, and records where things are."""
 
     def __init__(self, action: ArmAction, context: MissionContext) -> None:
         super().__init__(describe(action), context)
@@ -162,8 +162,8 @@ class ArmNode(Leaf):
             elif isinstance(lost, HeldThing):
                 given = self.context.given.get(lost.name)
                 if given and given.at is None:
-                    self.context.things[lost.name] = given  # it stands somewhere, to be seen
-            if outcome.placed:  # at once, as the way back may be cut short
+                    self.context.things[lost.name] = given  # cameras have to locate it again
+            if outcome.placed:  # before the command ends, as its retreat may be cut short
                 name, solid = outcome.placed
                 given = self.context.given.get(name, solid)
                 self.context.things[name] = solid if given.at else given
@@ -175,7 +175,7 @@ class ArmNode(Leaf):
 
 
 class OfferNode(ArmNode):
-    """Holds still until what is held is pulled at, or a person says that it may let go."""
+    """Holds still until a person pulls at the held thing, takes it, or confirms to let go."""
 
     def __init__(self, seconds: float, context: MissionContext) -> None:
         super().__init__(AwaitTaken(), context)
@@ -188,7 +188,7 @@ class OfferNode(ArmNode):
         self._until_s = self.context.free_s + self._seconds
 
     def delay(self, seconds: float) -> None:
-        """Wait for so much longer."""
+        """Extend the time limit by `seconds`."""
         self._until_s += seconds
 
     def update(self) -> Status:
@@ -211,9 +211,9 @@ class OfferNode(ArmNode):
 
 
 class SeekNode(Leaf):
-    """Drives before the nearest wanted thing or tag, and looks for one while none is known.
+    """Drives to the nearest wanted object or tag, and looks around while none is known.
 
-    One that is no longer known on the way may be hidden, or hard to recognise: it goes there once.
+    A target that gets lost on the way may only be hidden: the robot still drives there once.
     """
 
     def __init__(self, wanted: Wanted, context: MissionContext) -> None:
@@ -222,28 +222,28 @@ class SeekNode(Leaf):
         self._command = DriveCommand(0, "look")
         self._id: int | None = None  # of the target
         self._seek = 0
-        self._missed: dict[int, str] = {}  # ids that it cannot get to, and why
-        self._left: list[Target] = []  # where it was, and did not know the thing any more
+        self._unreached: dict[int, str] = {}  # reasons, by id of the target
+        self._tried: list[Target] = []  # places that it reached, but without the target
 
     def initialise(self) -> None:
         """Start the node, or start it again."""
         self._seek = next(self.context.numbers)
         self._command, self._id = DriveCommand(self._seek, "look", seek=self._seek), None
-        self._missed, self._left = {}, []
+        self._unreached, self._tried = {}, []
 
     def update(self) -> Status:
         """Advance the node by one tick, and return its status."""
         outcome = self.context.outcome
         ended = outcome and outcome.number == self._command.number and outcome.state != "running"
         if outcome and ended and self._command.kind == "look":
-            return self.failed(self._why(outcome.reason))
+            return self.failed(self._not_found(outcome.reason))
         if outcome and ended and outcome.state != "done" and self._id is not None:
-            self._missed[self._id] = outcome.reason
-        found = self.context.seek(self._wanted, self._missed, self._id)
+            self._unreached[self._id] = outcome.reason
+        found = self.context.seek(self._wanted, self._unreached, self._id)
         if outcome and ended and outcome.state == "done" and found.target and found.id == self._id:
             return Status.SUCCESS
         if ended and self._command.target:
-            self._left.append(self._command.target)
+            self._tried.append(self._command.target)
         self._choose(found)
         target = self._command.target
         self.context.doing = f"going before {target.name}" if target else self.name
@@ -254,58 +254,60 @@ class SeekNode(Leaf):
         return Status.RUNNING
 
     def _choose(self, found: Sought) -> None:
-        """Give another command if there is another target, or if it is somewhere else."""
+        """Issue a new command if the target is another one, or moved."""
         target, before = found.target, self._command.target
         if target is None:
-            gone = before and any(_apart(before, one) <= LEFT_M for one in self._left)
-            if gone or (before is None and self._command.kind != "look"):
+            lost = before and any(_distance(before, place) <= TRIED_M for place in self._tried)
+            if lost or (before is None and self._command.kind != "look"):
                 number = next(self.context.numbers)
                 self._command, self._id = DriveCommand(number, "look", seek=self._seek), None
             return
-        if found.id != self._id or before is None or _apart(target, before) > MOVED_M:
+        if found.id != self._id or before is None or _distance(target, before) > TARGET_MOVED_M:
             number = next(self.context.numbers)
             self._command = DriveCommand(number, "approach", target=target)
             self._id = found.id
 
-    def _why(self, reason: str) -> str:
+    def _not_found(self, reason: str) -> str:
         text = f"{named(self._wanted)} was not found: {reason}"
-        if self._missed:
-            text = "; ".join((*dict.fromkeys(self._missed.values()), text))
+        if self._unreached:
+            text = "; ".join((*dict.fromkeys(self._unreached.values()), text))
         return text
 
 
 class PickNode(ArmNode):
-    """Picks a thing up; a body that can drive looks for it first, and goes near enough."""
+    """Picks up a thing; a body that can drive also searches for it, and drives near enough."""
 
     def __init__(self, action: Pick, context: MissionContext) -> None:
         super().__init__(action, context)
-        self._way: DriveNode | SeekNode | None = None  # to where the arm tries again
-        self._ways = 0
+        self._approach: DriveNode | SeekNode | None = None  # the arm tries again after it
+        self._approaches = 0
 
     def initialise(self) -> None:
         """Start the node, or start it again."""
         super().initialise()
-        self._way, self._ways = None, 0
+        self._approach, self._approaches = None, 0
 
     def update(self) -> Status:
         """Advance the node by one tick, and return its status."""
-        if self._way:
-            status = self._way.update()
+        if self._approach:
+            status = self._approach.update()
             if status is not Status.SUCCESS:
                 return status
-            self._way = None
+            self._approach = None
             super().initialise()
-        self._way = self._next_way()
-        if self._way is None:
+        self._approach = self._next_approach()
+        if self._approach is None:
             return super().update()
-        self._ways += 1
-        self._way.initialise()
-        return self._way.update()
+        self._approaches += 1
+        self._approach.initialise()
+        return self._approach.update()
 
-    def _next_way(self) -> DriveNode | SeekNode | None:
+    def _next_approach(self) -> DriveNode | SeekNode | None:
         outcome, command = self.context.outcome, self._command
         assert command
-        if outcome is None or outcome.number != command.number or self._ways == MAX_WAYS:
+        if self._approaches == MAX_APPROACHES:
+            return None
+        if outcome is None or outcome.number != command.number:
             return None
         if outcome.approach:
             return DriveNode("approach", self.context, target=outcome.approach)
@@ -334,9 +336,9 @@ class WaitNode(Leaf):
 
 
 class ConditionNode(Leaf):
-    """Succeeds if a condition holds; otherwise waits or fails. An unknown value does not hold.
+    """Succeeds if a condition holds; otherwise waits or fails, also if the value is unknown.
 
-    A topic is subscribed to when it is read first, so its first message may still be on the way.
+    The first read of a topic subscribes to it, so its first message may still be in transit.
     """
 
     def __init__(self, condition: Condition, context: MissionContext, *, waits: bool) -> None:
@@ -361,7 +363,7 @@ class ConditionNode(Leaf):
 
 
 class ScriptNode(Leaf):
-    """Runs a program of the host, which ends with the node."""
+    """Runs a program of the host, and stops it if the node is interrupted."""
 
     def __init__(self, script: Script, context: MissionContext) -> None:
         super().__init__(f"running {script.run}", context)
@@ -377,16 +379,16 @@ class ScriptNode(Leaf):
         assert self._running
         self.context.doing, result = self.name, self._running.result
         if result is None:
-            self.context.scripts.go_on(self._running)
+            self.context.scripts.keep_running(self._running)
             return Status.RUNNING
         return Status.SUCCESS if result[0] else self.failed(f"{self._script.run} {result[1]}")
 
     def terminate(self, new_status: Status) -> None:
-        """Stop what the node has started."""
+        """Stop the program."""
         if self._running:
             self.context.scripts.stop(self._running)
             self._running = None
 
 
-def _apart(one: Target, other: Target) -> float:
+def _distance(one: Target, other: Target) -> float:
     return math.hypot(one.x - other.x, one.y - other.y)

@@ -1,4 +1,4 @@
-"""Missions: trees of steps as frozen Structs, as their files have them."""
+"""Missions: trees of steps, as frozen Structs with the fields of mission files."""
 
 from collections.abc import Iterator
 from typing import Annotated
@@ -24,7 +24,7 @@ from gigabrain_zenoh.decision.tasks.arm_steps import (
 )
 
 MAX_LOOPS = 1_000_000
-# x, y [m] and maybe yaw [rad]; see `_beyond`
+# x, y [m] and optionally yaw [rad]; see mission_files._out_of_range
 Point = Annotated[tuple[Angle, ...], Meta(min_length=2, max_length=3)]
 
 
@@ -33,7 +33,7 @@ class Part(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_d
 
 
 class AtTag(Part, frozen=True, kw_only=True):
-    """Before a tag, such as one at a charger."""
+    """A place in front of a tag, such as one at a charger."""
 
     tag: TagId
 
@@ -55,11 +55,11 @@ class Patrol(Part, frozen=True, kw_only=True):
 
     points: Places
     loops: Times | None = None  # None: for ever
-    wait: Pause = 0.0  # [s] at each
+    wait: Pause = 0.0  # [s] at each place
 
 
 class Explore(Part, frozen=True, kw_only=True):
-    """Drive until nothing unknown is reachable."""
+    """Drive until no unknown space is reachable."""
 
 
 class Visit(Part, frozen=True, kw_only=True):
@@ -108,7 +108,7 @@ class BatteryBelow(Part, frozen=True, kw_only=True):
 
     percentage: Percentage
     goto: Place
-    until: Percentage | None = None  # charge to continue at; None: the mission ends there
+    until: Percentage | None = None  # continue at this charge; None: the mission ends at the place
     do: Steps
 
     def __post_init__(self) -> None:
@@ -123,23 +123,23 @@ class Step(Part, frozen=True, kw_only=True):
 
     goto: Place | None = None
     patrol: Patrol | None = None
-    find: Wanted | None = None  # a thing by its class: look for one, and drive before it
+    find: Wanted | None = None  # search for an object of a class, or a tag, and drive to it
     explore: Explore | None = None
     visit: Visit | None = None
     reach: Point3 | Reach | None = None  # with the arm's tool
     posture: Posture | None = None  # of the arm's joints
     gripper: GripperPlace | None = None
     pick: Name | None = None  # one of the mission's `things`
-    place: Spot | None = None  # where the middle of what is held shall be; on the floor without z
-    press: PointOrThing | Press | None = None  # a place, or one of the mission's `things`
-    hand_over: Point3 | HandOver | None = None  # what is held, to a person
+    place: Spot | None = None  # target of the held thing's centre; without z, on the floor
+    press: PointOrThing | Press | None = None  # a point, or one of the mission's `things`
+    hand_over: Point3 | HandOver | None = None  # the held thing, to a person
     wait: Seconds | None = None
     wait_until: Comparison | None = None
     check: Comparison | None = None  # fails if it does not hold
     script: Script | None = None
     tree: Name | None = None  # one of the mission's `trees`
     sequence: Steps | None = None
-    fallback: Steps | None = None  # the first that succeeds
+    fallback: Steps | None = None  # until one succeeds
     retry: Retry | None = None
     repeat: Repeat | None = None
     timeout: Timeout | None = None
@@ -169,8 +169,8 @@ class Mission(Part, frozen=True, kw_only=True):
     """A mission file."""
 
     places: dict[Name, Point] = {}  # names of places: x, y [m] and optionally yaw [rad]
-    things: dict[Name, Solid] = {}  # what stands round the arm at the beginning
-    trees: dict[Name, Steps] = {}  # names of steps that are used several times
+    things: dict[Name, Solid] = {}  # around the arm at the start
+    trees: dict[Name, Steps] = {}  # named steps, to be used several times
     do: Steps  # in order
 
     def goal(self, place: Name | Point) -> Goal:
@@ -180,7 +180,7 @@ class Mission(Part, frozen=True, kw_only=True):
 
     @property
     def scripts(self) -> Iterator[str]:
-        """Names of the host's programs that it runs."""
+        """Names of the programs that the mission runs."""
         return (step.script.run for _, step in steps_of(self) if step.script)
 
     @property
@@ -195,7 +195,7 @@ class Mission(Part, frozen=True, kw_only=True):
 
     @property
     def looks(self) -> bool:
-        """Return whether any step needs a camera that recognises things or tags."""
+        """Return whether any step needs a camera that recognises objects or tags."""
         return any(
             step.find is not None or any(isinstance(place, AtTag) for _, place in places_of(step))
             for _, step in steps_of(self)
@@ -211,7 +211,7 @@ class PatrolFile(Part, frozen=True, kw_only=True):
 
 
 def explore_mission() -> Mission:
-    """Return the mission that explores, and then visits one place after the other."""
+    """Return a mission that explores, and then visits one place after another."""
     visit = Step(fallback=(Step(visit=Visit()), Step(wait=5.0)))
     return Mission(do=(Step(explore=Explore()), Step(repeat=Repeat(do=(visit,)))))
 
@@ -223,7 +223,7 @@ def goal_mission(goal: Goal) -> Mission:
 
 
 def find_mission(wanted: str | int) -> Mission:
-    """Return the mission that drives before a thing of a class, or before a tag."""
+    """Return the mission that searches for an object of a class or a tag, and drives to it."""
     return Mission(do=(Step(find=AtTag(tag=wanted) if isinstance(wanted, int) else wanted),))
 
 
@@ -234,12 +234,12 @@ def patrol_mission(patrol: PatrolFile, loops: int | None) -> str:
 
 
 def text_of(mission: Mission) -> str:
-    """Return a mission as the text that a robot takes."""
+    """Return a mission as the text that is sent to a robot."""
     return msgspec.json.encode(mission).decode()
 
 
 def map_places(mission: Mission) -> Iterator[str]:
-    """Yield the names of places that are not the mission's own, so must be the map's."""
+    """Yield the names of places that the mission does not define, so the map has to."""
     for _, step in steps_of(mission):
         for _, place in places_of(step):
             if isinstance(place, str) and place not in mission.places:

@@ -1,6 +1,6 @@
-"""Mission files: read, and checked completely before anything moves.
+"""Reads mission files, and checks them completely before anything moves.
 
-Checks that need more than one step, such as names of places and the depth of trees, come last.
+Checks of more than one step, such as names of places and the depth of trees, come last.
 """
 
 from collections.abc import Iterable, Iterator, Mapping
@@ -33,8 +33,8 @@ from gigabrain_zenoh.decision.tasks.mission import (
 from gigabrain_zenoh.errors import ConfigError, unknown
 
 MAX_BYTES = 60_000  # of a mission that is sent to a robot
-MAX_STEPS = 2000  # with each `tree` written out
-MAX_DEPTH = 50  # of nested steps, likewise; carrying them out is recursive
+MAX_STEPS = 2000  # with each `tree` expanded
+MAX_DEPTH = 50  # of nested steps with each `tree` expanded: their execution is recursive
 TOO_DEEP = f"more than {MAX_DEPTH} nested steps once every tree is written out"
 BOUNDS = get_args(Coordinate)[1]  # [m], of x and y
 
@@ -42,7 +42,7 @@ BOUNDS = get_args(Coordinate)[1]  # [m], of x and y
 def load(path: Path) -> tuple[Mission, str]:
     """Return the mission in a file, and its text. Raises ConfigError with file and line.
 
-    Names of places that are not in the file may be those of the robot's map: it checks them.
+    Places that the file does not define may be in the robot's map; the robot checks them.
     """
     text = loading.read(path)
     refuse_long(text, str(path))
@@ -58,43 +58,43 @@ def refuse_long(text: str, source: str) -> None:
 def loads(text: str, source: str, places: Iterable[MapPlace] | None = ()) -> Mission:
     """Return the mission in a YAML text; `source` names it in errors. Raises ConfigError.
 
-    The `places` of the map that it names are added to its own, which come first; None if they are
-    not known.
+    Places that the mission uses but does not define are taken from `places` of the map; None skips
+    their check.
     """
     root = loading.document(text, source)
     mission = loading.converted(root, Mission, lambda line: f"{source}:{line}")
     for line, problem in _without_value(root):
         raise ConfigError(f"{source}:{line}: {problem}")
-    named = set(map_places(mission))
+    undefined = set(map_places(mission))
     if places is not None:
-        used = {one.name: _point(one) for one in places if one.name in named}
+        used = {place.name: _point(place) for place in places if place.name in undefined}
         mission = replace(mission, places={**used, **mission.places})
-    _refuse(_problems(mission, frozenset(named if places is None else ())), text, source)
+    _refuse(_problems(mission, frozenset(undefined if places is None else ())), text, source)
     return mission
 
 
 def _without_value(node: Node) -> Iterator[tuple[int, str]]:
-    """Yield each field of a step that would be dropped, as it stands without a value by another."""
+    """Yield line and problem of each field without a value beside one with a value."""
     for item in node.items or ():
         entries = item.entries or ()
-        empty = [one for one in entries if one.node.value is None and not one.node.text]
-        kind = next((one.key for one in entries if one.node.value is not None), None)
-        for one in empty if kind else ():
-            text = f"{one.key!r} has no value, and this step is {kind!r} already; split it in two"
-            yield one.line, text
-    for inner in (*(node.items or ()), *(one.node for one in node.entries or ())):
+        empty = [entry for entry in entries if entry.node.value is None and not entry.node.text]
+        kind = next((entry.key for entry in entries if entry.node.value is not None), None)
+        for entry in empty if kind else ():
+            text = f"{entry.key!r} has no value, and this step is {kind!r} already; split it in two"
+            yield entry.line, text
+    for inner in (*(node.items or ()), *(entry.node for entry in node.entries or ())):
         yield from _without_value(inner)
 
 
 def restored(text: str, source: str) -> Mission:
     """Return the mission in a text of `text_of`, read as JSON. Raises ConfigError.
 
-    YAML allows fewer characters in a JSON text, and folds some of them.
+    YAML would refuse or fold some characters of a JSON text.
     """
     try:
         mission = msgspec.json.decode(text, type=Mission)
     except DECODE_ERRORS:
-        return loads(text, source)  # raises the error with its place
+        return loads(text, source)  # raises the error with its line
     return loads(text, source) if any(_problems(mission, frozenset())) else mission
 
 
@@ -107,7 +107,7 @@ def load_patrol(path: Path) -> PatrolFile:
     text = loading.read(path)
     patrol = loading.loads(text, PatrolFile, str(path))
     points: dict[Keys, Place] = {("points", i): place for i, place in enumerate(patrol.points)}
-    _refuse(_beyond(points | _own_places(patrol)), text, str(path))
+    _refuse(_out_of_range(points | _own_places(patrol)), text, str(path))
     return patrol
 
 
@@ -121,8 +121,8 @@ def _own_places(file: Mission | PatrolFile) -> dict[Keys, Place]:
     return {("places", name): place for name, place in file.places.items()}
 
 
-def _beyond(places: Mapping[Keys, Place]) -> Iterator[tuple[Keys, str]]:
-    """Yield each coordinate that is in no map."""
+def _out_of_range(places: Mapping[Keys, Place]) -> Iterator[tuple[Keys, str]]:
+    """Yield each coordinate that is out of range for any map."""
     for keys, place in places.items():
         for i, value in enumerate(place[:2] if isinstance(place, tuple) else ()):
             if not BOUNDS.ge <= value <= BOUNDS.le:
@@ -131,10 +131,10 @@ def _beyond(places: Mapping[Keys, Place]) -> Iterator[tuple[Keys, str]]:
 
 
 def _problems(mission: Mission, elsewhere: frozenset[str]) -> Iterator[tuple[Keys, str]]:
-    """Yield all problems; the places `elsewhere` are not checked."""
-    yield from _beyond(_own_places(mission))
+    """Yield all problems; names of places in `elsewhere` are not checked."""
+    yield from _out_of_range(_own_places(mission))
     for keys, step in steps_of(mission):
-        yield from _in_step(keys, step, mission, elsewhere)
+        yield from _step_problems(keys, step, mission, elsewhere)
     depths: dict[str, int] = {}
     for name in mission.trees:
         if problem := _tree_problem(name, mission, (), depths):
@@ -145,10 +145,10 @@ def _problems(mission: Mission, elsewhere: frozenset[str]) -> Iterator[tuple[Key
         yield ("do",), f"more than {MAX_STEPS} steps once every tree is written out"
 
 
-def _in_step(
+def _step_problems(
     keys: Keys, step: Step, mission: Mission, elsewhere: frozenset[str]
 ) -> Iterator[tuple[Keys, str]]:
-    yield from _beyond({(*keys, *more): place for more, place in places_of(step)})
+    yield from _out_of_range({(*keys, *more): place for more, place in places_of(step)})
     for more, place in places_of(step):
         if isinstance(place, str) and place not in mission.places and place not in elsewhere:
             yield (*keys, *more), str(unknown("place", place, mission.places or ("none",)))
@@ -191,25 +191,25 @@ def _tree_problem(
     return TOO_DEEP if depths[name] > MAX_DEPTH else ""
 
 
-def _depth(steps: tuple[Step, ...], of_trees: dict[str, int]) -> int:
-    """Return the greatest depth of nested steps, with every tree written out."""
+def _depth(steps: tuple[Step, ...], tree_depths: dict[str, int]) -> int:
+    """Return the depth of nested steps, with each tree expanded."""
     return 1 + max(
-        max((_depth(inner, of_trees) for _, inner in inner_steps(step)), default=0)
+        max((_depth(inner, tree_depths) for _, inner in inner_steps(step)), default=0)
         if step.tree is None
-        else of_trees[step.tree]
+        else tree_depths[step.tree]
         for step in steps
     )
 
 
-def _size(steps: tuple[Step, ...], mission: Mission, known: dict[str, int]) -> int:
-    """Return the number of steps with every tree written out. There must be no cycle."""
+def _size(steps: tuple[Step, ...], mission: Mission, tree_sizes: dict[str, int]) -> int:
+    """Return the number of steps with each tree expanded. There must be no cycle."""
     count = 0
     for _, step in steps_below((), steps):
         count += 1
         if step.tree is not None:
-            if step.tree not in known:
-                known[step.tree] = _size(mission.trees[step.tree], mission, known)
-            count += known[step.tree]
+            if step.tree not in tree_sizes:
+                tree_sizes[step.tree] = _size(mission.trees[step.tree], mission, tree_sizes)
+            count += tree_sizes[step.tree]
     return count
 
 

@@ -1,4 +1,4 @@
-"""Programs of the host that missions may run, from one folder only."""
+"""Runs programs of the host for missions, from one folder only."""
 
 import asyncio
 import contextlib
@@ -16,16 +16,16 @@ from gigabrain_zenoh.host.files import expanded
 
 log = logging.getLogger(__name__)
 
-MAX_OUTPUT = 200  # bytes of a program's output that its result shows, the last ones
-LINGER_S = 1.0  # for the rest of its output, once it has ended
-# becomes the program once it reads a line; ends if its input is closed before
+MAX_OUTPUT = 200  # last bytes of a program's output, shown in its result
+LINGER_S = 1.0  # wait for the rest of the output after a program ended
+# becomes the program after reading a line; ends if its input is closed before that
 LEASHED = 'read -r _ && exec "$@" </dev/null'
-# kills a program's process group once its input is closed, also if that group is stopped
+# kills a process group, also a stopped one, when its own input is closed
 LEASH = 'read -r _; kill -s KILL -- "-$1"'
 
 
 class Scripts:
-    """Starts programs of the folder that the deployment file allows."""
+    """Starts programs from the folder that the deployment file allows."""
 
     def __init__(self, folder: str) -> None:
         self._folder = expanded(folder).absolute() if folder else None
@@ -38,12 +38,12 @@ class Scripts:
                 "deployment file, as in decision: {settings: {scripts: /home/robot/scripts}}"
             )
         try:
-            there = sorted(p.name for p in self._folder.glob("*") if p.is_file())
+            known = sorted(p.name for p in self._folder.glob("*") if p.is_file())
         except OSError as error:
             text = f"script {name!r}: {self._folder} cannot be read: {error.strerror}"
             raise Refused(text) from None
-        if name not in there:
-            raise unknown("script", name, there or ("none",))
+        if name not in known:
+            raise unknown("script", name, known or ("none",))
         path = self._folder / name
         if not os.access(path, os.X_OK):
             raise Refused(f"script {name!r} is not executable; chmod +x {path}")
@@ -55,23 +55,23 @@ class Scripts:
 
 
 class Run:
-    """One program while it runs, in a process group of its own."""
+    """One running program, in its own process group."""
 
     def __init__(self, scripts: Scripts, script: Script) -> None:
-        self.result: tuple[bool, str] | None = None  # success, and a text for people
+        self.result: tuple[bool, str] | None = None  # success, and a text for users
         self._program: asyncio.SubprocessTransport | None = None
-        self._limit: asyncio.Timeout | None = None  # of its time, while it runs
+        self._limit: asyncio.Timeout | None = None  # time limit, while it runs
         self._left_s = script.seconds
         self._resumed = asyncio.Event()
         self._resumed.set()
         self._task = asyncio.ensure_future(self._run(scripts, script))
 
     def stop(self) -> None:
-        """Kill it and all that it has started."""
+        """Kill the program and all its processes."""
         self._task.cancel()
 
     def pause(self) -> None:
-        """Stop it and all that it has started until `resume`; its time limit waits as well."""
+        """Stop the program and all its processes until `resume`, and so its time limit."""
         self._resumed.clear()
         if self._limit and not self._limit.expired() and (end_s := self._limit.when()):
             self._left_s = end_s - asyncio.get_running_loop().time()
@@ -79,7 +79,7 @@ class Run:
             self._signal(signal.SIGSTOP)
 
     def resume(self) -> None:
-        """Have it go on, if it is paused."""
+        """Continue the program if it is paused."""
         self._resumed.set()
         if self._limit and self._limit.when() is None:
             self._limit.reschedule(asyncio.get_running_loop().time() + self._left_s)
@@ -106,7 +106,7 @@ class Run:
     async def _outcome(
         self, program: asyncio.SubprocessTransport, output: "_Output", seconds: float
     ) -> tuple[bool, str]:
-        """Begin a program, wait for its end, kill its process group, and return its outcome."""
+        """Let a program begin, wait for its end, kill its process group, and return its result."""
         try:
             await self._resumed.wait()
             cast("asyncio.WriteTransport", program.get_pipe_transport(0)).write(b"\n")
@@ -123,7 +123,7 @@ class Run:
             ):  # a process outside the group may keep the output open
                 await asyncio.wait_for(output.silent.wait(), LINGER_S)
         code = program.get_returncode()
-        return code == 0, _in_words(code, str(output))
+        return code == 0, _describe_end(code, str(output))
 
     def _signal(self, number: signal.Signals) -> None:
         assert self._program
@@ -131,7 +131,7 @@ class Run:
             os.killpg(self._program.get_pid(), number)
         except ProcessLookupError:
             pass
-        except PermissionError as error:  # it runs as another user, as by sudo
+        except PermissionError as error:  # it runs as another user, for example by sudo
             log.warning("a script cannot be sent %s: %s", number.name, error)
 
 
@@ -139,7 +139,7 @@ StartScript = Callable[[Script], Run]
 
 
 class RunningScripts:
-    """The programs of all missions, of which only that of the active step goes on."""
+    """The programs of all missions; all are paused except that of the active step."""
 
     def __init__(self, start: StartScript) -> None:
         self._start, self._running, self._active = start, set[Run](), set[Run]()
@@ -150,8 +150,8 @@ class RunningScripts:
         self._running.add(run)
         return run
 
-    def go_on(self, run: Run) -> None:
-        """Have a program go on for the present step."""
+    def keep_running(self, run: Run) -> None:
+        """Let a program run until the next `settle`."""
         self._active.add(run)
 
     def stop(self, run: Run) -> None:
@@ -160,7 +160,7 @@ class RunningScripts:
         run.stop()
 
     def settle(self) -> None:
-        """Pause all programs but those that go on; to be called after each step."""
+        """Pause all programs except those passed to `keep_running`; called after each step."""
         for run in self._running:
             run.resume() if run in self._active else run.pause()
         self._active.clear()
@@ -168,7 +168,7 @@ class RunningScripts:
 
 @contextlib.asynccontextmanager
 async def _leash(group: int) -> AsyncIterator[None]:
-    """Have a process group killed if this process ends during the block, even by SIGKILL."""
+    """Ensure that a process group is killed if this process ends in the block, even by SIGKILL."""
     leash, output = await asyncio.get_running_loop().subprocess_exec(
         _Output, "/bin/sh", "-c", LEASH, "sh", str(group),
         start_new_session=True, stdin=asyncio.subprocess.PIPE,
@@ -204,6 +204,6 @@ class _Output(asyncio.SubprocessProtocol):
         self.ended.set()
 
 
-def _in_words(code: int | None, output: str) -> str:
+def _describe_end(code: int | None, output: str) -> str:
     ended = "ended well" if code == 0 else f"ended with exit code {code}"
     return f"{ended}: {output}" if output else ended

@@ -1,4 +1,4 @@
-"""The queue of tasks, and the task that is active. Apart from `TaskFile`, it knows no disk."""
+"""The queue of tasks with the active one first. Only `TaskFile` uses the disk."""
 
 import itertools
 from collections.abc import Sequence
@@ -36,15 +36,15 @@ from gigabrain_zenoh.errors import ConfigError, Refused
 from gigabrain_zenoh.host.files import make_folder, read_bounded, replace_file, too_large
 
 MAX_QUEUED, MAX_DONE = 32, 16
-LONGER_AS_JSON = 10  # times as a mission's text: numbers get digits, and moved things a place
-MAX_FILE_BYTES = (MAX_QUEUED + 1) * LONGER_AS_JSON * MAX_REQUEST_BYTES
+MAX_JSON_GROWTH = 10  # JSON is longer than a mission's text: more digits, places of moved things
+MAX_FILE_BYTES = (MAX_QUEUED + 1) * MAX_JSON_GROWTH * MAX_REQUEST_BYTES
 LOST = "tasks will not survive a restart"
 AFTER_A_RESTART = "the robot was restarted; resume the task, or cancel it"
 NO_GOAL = Idle("waiting", "waiting: for a goal")
 
 
 class SavedJob(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """A task as the file holds it."""
+    """A task in the task file."""
 
     id: str
     kind: Literal["goal", "mission"]
@@ -54,7 +54,7 @@ class SavedJob(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     held: bool = False
     why_held: str = ""
     memory: Progress = {}
-    things: dict[Name, Solid] | None = None  # where they are by now; None: as the mission says
+    things: dict[Name, Solid] | None = None  # their current state; None: as in the mission
 
 
 class Job:
@@ -65,7 +65,7 @@ class Job:
         self.id, self.begun = saved.id, bool(saved.memory)
         self.held, self.why_held = saved.held, saved.why_held  # held: paused by a person
         self._root = TreeBuilder(mission, context).tree()
-        self._things = bool(mission.things)
+        self._has_things = bool(mission.things)
         if saved.things is not None:
             context.things = dict(saved.things)
         restore(self._root, saved.memory)
@@ -88,11 +88,11 @@ class Job:
             id=self.id, kind=self._saved.kind, label=self._saved.label, source=self._saved.source,
             mission=self._saved.mission, held=self.held, why_held=self.why_held,
             memory=progress_of(self._root, self.context.free_s),
-            things=dict(self.context.things) if self._things else None,
+            things=dict(self.context.things) if self._has_things else None,
         )  # fmt: skip
 
     def task(self, state: TaskState, reason: str = "", outcome: StepOutcome | None = None) -> Task:
-        """Return the task as published; a goal that has ended has its errors from `outcome`."""
+        """Return the task as published; `outcome` has the errors of a goal that ended."""
         saved = self._saved
         measured = outcome if saved.kind == "goal" else None
         return Task(
@@ -104,9 +104,9 @@ class Job:
 
 
 class Saved(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, tag="gigabrain tasks"):
-    """All tasks, as the file holds them."""
+    """The content of the task file."""
 
-    boot: int = 0  # start of the driver in which they were begun
+    boot: int = 0  # start of the driver in which the tasks were begun
     count: int = 0  # of all tasks so far
     jobs: tuple[SavedJob, ...] = ()  # the active one first
     held: Held | None = None  # what the gripper holds
@@ -126,29 +126,29 @@ class TaskQueue:
         self._jobs: list[Job] = []
         self._done: list[Task] = []
         self._outcome: StepOutcome | None = None
-        for one in saved.jobs:
+        for job in saved.jobs:
             try:
-                mission = restored(one.mission, one.label)
+                mission = restored(job.mission, job.label)
             except ConfigError as error:
-                self._done.insert(0, _unreadable(one, error))
+                self._done.insert(0, _unreadable(job, error))
                 continue
-            self._jobs.append(Job(one, mission, self._context()))
+            self._jobs.append(Job(job, mission, self._context()))
         self._from_disk = list(self._jobs)
 
     def restart(self, boot: int) -> None:
-        """Record a start of the driver; tasks on disk from another one wait for a person."""
+        """Record a start of the driver; tasks of an earlier start are paused for a person."""
         if self._boot != boot:
             for job in self._from_disk:
                 job.held, job.why_held = True, AFTER_A_RESTART
         self._boot, self._from_disk = boot, []
 
     def add_goal(self, goal: Goal, how: How, source: str, place: str = "") -> str:
-        """Add a goal, maybe with a `place` name; return its name. Raises Refused if it is full."""
+        """Add a goal, and return its task's name. Raises Refused if the queue is full."""
         label = f"{place} {describe_goal(goal)}".strip()[:64]
         return self._add("goal", goal_mission(goal), label, how, source)
 
     def add_find(self, wanted: Wanted, how: How, source: str) -> str:
-        """Add a goal before a thing or a tag; return its name. Raises Refused if it is full."""
+        """Add a search, and return its task's name. Raises Refused if the queue is full."""
         return self._add("goal", find_mission(wanted), f"find {named(wanted)}"[:64], how, source)
 
     def add_mission(self, mission: Mission, label: str, how: How, source: str) -> str:
@@ -156,7 +156,7 @@ class TaskQueue:
         return self._add("mission", mission, label, how, source)
 
     def cancel(self, name: str, source: str) -> str:
-        """Cancel a task, the active one (no name) or all; return a text. Raises Refused."""
+        """Cancel a task by name, the active one ("") or "all"; return a text. Raises Refused."""
         if name == "all":
             count = len(self._jobs)
             while self._jobs:
@@ -173,7 +173,7 @@ class TaskQueue:
         return f"{job.id} is paused"
 
     def resume(self, name: str) -> str:
-        """Resume a paused task, or have one that hands something over let go of it.
+        """Resume a paused task, or confirm that a task that hands over may let go.
 
         Return a text. Raises Refused.
         """
@@ -191,12 +191,12 @@ class TaskQueue:
     def step(self, seconds: float, outcome: StepOutcome | None) -> tuple[Command | None, Idle]:
         """Advance by `seconds` with the last command's outcome.
 
-        Return the next command, and why the robot stands if there is none.
+        Return the next command, and the reason to stand still if there is none.
         """
         self._outcome = outcome
-        wanted = self._advance(seconds, outcome)
+        command_or_idle = self._advance(seconds, outcome)
         self._scripts.settle()
-        return wanted
+        return command_or_idle
 
     def _advance(self, seconds: float, outcome: StepOutcome | None) -> tuple[Command | None, Idle]:
         while self._jobs:
@@ -214,12 +214,12 @@ class TaskQueue:
         return None, NO_GOAL
 
     def is_unused(self, boot: int) -> bool:
-        """Return whether there is no task, nor was there one in this start of the driver."""
+        """Return whether there is no task, and was none since this start of the driver."""
         return not self._jobs and self._boot != boot
 
     @property
     def held(self) -> Held | None:
-        """Return what the gripper holds, as far as decision knows."""
+        """Return what the gripper holds; None if that is nothing or unknown."""
         return self._hand.held
 
     @property
@@ -298,24 +298,24 @@ def _queued(job: Job, first: str) -> Task:
     return job.task("paused", f"preempted by {first}") if job.begun else job.task("queued")
 
 
-def _unreadable(one: SavedJob, error: ConfigError) -> Task:
+def _unreadable(job: SavedJob, error: ConfigError) -> Task:
     return Task(
-        id=one.id[:64], kind=one.kind, label=one.label[:64], source=one.source[:64],
+        id=job.id[:64], kind=job.kind, label=job.label[:64], source=job.source[:64],
         state="failed", reason=f"the saved mission is invalid: {error}"[:500],
     )  # fmt: skip
 
 
 class TaskFile:
-    """The file that keeps tasks over a restart of decision; none without a folder.
+    """The file that keeps tasks over a restart of decision; without a folder there is none.
 
-    It is replaced as a whole and synced.
+    Each write replaces the whole file and syncs it.
     """
 
     def __init__(self, folder: str) -> None:
         self._path = Path(folder) / "tasks.json" if folder else None
 
     def read(self) -> tuple[Saved, str]:
-        """Return the saved tasks, and a problem in one line. A damaged file is set aside."""
+        """Return the saved tasks, and a problem in one line. A damaged file is renamed."""
         if self._path is None:
             return Saved(), ""
         try:
@@ -332,7 +332,7 @@ class TaskFile:
         if self._path is None:
             return ""
         data = msgspec.json.encode(newest[-1])
-        if len(data) > MAX_FILE_BYTES:  # it could not be read again
+        if len(data) > MAX_FILE_BYTES:  # `read` would refuse it
             return f"not saved: {too_large(self._path, len(data), MAX_FILE_BYTES)}; {LOST}"
         try:
             make_folder(self._path.parent)
