@@ -4,7 +4,7 @@ Each candidate is a pair of a delay and a first-order lag on a grid. It predicts
 from the commands. Each axis has its own gain, and noise of unknown size. The estimate is the mean
 of all candidates, weighted by posterior: a Gaussian prior times the profile likelihood. The log
 likelihood is -n/2 log(squared error / n), summed over the axes, with exponential forgetting. A
-constant command carries no information about the response, so nothing is learnt from it.
+constant command carries no information about the response, so it is ignored.
 """
 
 import numpy as np
@@ -17,28 +17,28 @@ from gigabrain_zenoh.bus.freshness import LEAD_TICKS
 from gigabrain_zenoh.gate.state import BRAIN
 from gigabrain_zenoh.geometry.pose import velocity_of
 
-PRIOR = ActuationModel(delay=0.04, lag=0.06)  # used until enough has been learnt
+PRIOR = ActuationModel(delay=0.04, lag=0.06)  # used until there is an estimate
 DELAYS = 16  # candidates, a tick apart: 0 to 0.3 s
 DELAYS_S = TICK_S * np.arange(DELAYS)
 LAGS_S = TICK_S * np.arange(26)  # candidates: 0 to 0.5 s
-LATE_TICKS = 5  # how late a tick's messages may arrive without affecting the result
+LATE_TICKS = 5  # messages of a tick may arrive so late without affecting the result
 SILENT_TICKS = 5  # after this long without a command, the gate stops the body
-EXCITED_TICKS = 30  # how long a change of the command is informative
+EXCITED_TICKS = 30  # a change of the command is informative for so long
 MIN_CHANGE = (0.04, 0.15)  # [m/s], [rad/s], within EXCITED_TICKS; smaller changes drown in noise
 NOISE = (0.004, 0.01)  # [m/s], [rad/s], minimum; prevents overconfidence in an exact model
 MEMORY_TICKS = 1000  # excited ticks; time constant with which squared errors are forgotten
 ENOUGH_TICKS = 40  # excited ticks before the estimate is used
 EVALUATION_TICKS = 5  # between evaluations of all candidates
 SPREAD_S = 0.1  # standard deviation of the prior
-ALIKE = 4.0  # errors of neighbouring ticks correlate: this many ticks count as one sample
+CORRELATED_TICKS = 4.0  # count as one sample: errors of neighbouring ticks correlate
 GAINS = (0.5, 1.5)  # range of plausible gains; outside it the body is not driving freely
 
 
 class Axis:
     """Predictions and accumulated squared errors of all candidates, for one axis."""
 
-    def __init__(self, least_change: float, noise: float) -> None:
-        self._least_change, self._noise = least_change, noise
+    def __init__(self, min_change: float, noise: float) -> None:
+        self._min_change, self._noise = min_change, noise
         # a candidate with zero lag reaches the commanded speed by the next tick
         self._follows = 1.0 - np.exp(-TICK_S / np.maximum(LAGS_S, 1e-9))
         self._outputs = np.zeros((DELAYS, len(LAGS_S)))  # row 0: no delay, row 1: one tick, …
@@ -54,7 +54,7 @@ class Axis:
 
     def update(self, commanded: float, measured: float) -> bool:
         """Process one tick's commanded and measured speed; return whether it was informative."""
-        excited = max(self._commanded) - min(self._commanded) > self._least_change
+        excited = max(self._commanded) - min(self._commanded) > self._min_change
         if excited:
             keep = 1.0 - 1.0 / MEMORY_TICKS
             self._model_model = keep * self._model_model + self._outputs * self._outputs
@@ -68,8 +68,8 @@ class Axis:
 
     def gains(self) -> Floats:
         """Return the gain that fits each candidate's output best, within GAINS, (delays, lags)."""
-        found: Floats = self._model_measured / np.maximum(self._model_model, 1e-12)
-        return np.clip(found, *GAINS)
+        ratio: Floats = self._model_measured / np.maximum(self._model_model, 1e-12)
+        return np.clip(ratio, *GAINS)
 
     def cost(self) -> Floats:
         """Return each candidate's negative log likelihood, (delays, lags)."""
@@ -78,8 +78,8 @@ class Axis:
             2.0 * self._model_measured - gains * self._model_model
         )
         mean = np.maximum(errors, 0.0) / max(self.weight, 1.0)
-        found: Floats = 0.5 * self.weight * np.log(mean + self._noise**2)
-        return found
+        cost: Floats = 0.5 * self.weight * np.log(mean + self._noise**2)
+        return cost
 
 
 class ActuationEstimator:
@@ -91,7 +91,7 @@ class ActuationEstimator:
 
     @property
     def response(self) -> ActuationModel:
-        """Return the current estimate; the prior until enough has been learnt."""
+        """The current estimate; the prior until there are ENOUGH_TICKS."""
         return self._response
 
     def add_command(self, command: CmdVel) -> None:
@@ -125,11 +125,12 @@ class ActuationEstimator:
 
         The command of a tick may still be in transit when the state of the next tick arrives.
         """
-        mine = self._commander
-        coming = {
-            tick: command for (tick, source), command in self._commands.items() if source == mine
+        pending = {
+            tick: command
+            for (tick, source), command in self._commands.items()
+            if source == self._commander
         }
-        recent = {**self._past, **coming}
+        recent = {**self._past, **pending}
         return tuple(
             (tick, velocity_of(recent[tick])) for tick in sorted(recent) if after < tick <= until
         )
@@ -142,14 +143,14 @@ class ActuationEstimator:
         self._past: dict[int, CmdVel] = {}  # the commander's, already evaluated
         self._states: dict[int, RobotState] = {}
         self._command: CmdVel | None = None
-        self._axes = tuple(Axis(*each) for each in zip(MIN_CHANGE, NOISE, strict=True))
+        self._axes = tuple(Axis(*limits) for limits in zip(MIN_CHANGE, NOISE, strict=True))
         self._response = self._prior
 
     def _process(self, state: RobotState) -> None:
-        learnt = False
+        informative = False
         for tick in range(max(self._done + 1, state.tick - SILENT_TICKS), state.tick + 1):
             # a missed state is assumed to equal the next one
-            learnt |= self._one_tick(tick, state)
+            informative |= self._process_tick(tick, state)
         self._done = state.tick
         for tick, source in [key for key in self._commands if key[0] <= self._done]:
             command = self._commands.pop((tick, source))
@@ -157,10 +158,10 @@ class ActuationEstimator:
                 self._past[tick] = command
         for tick in [tick for tick in self._past if tick <= self._done - DELAYS]:
             del self._past[tick]
-        if learnt and self._done % EVALUATION_TICKS == 0:
+        if informative and self._done % EVALUATION_TICKS == 0:
             self._evaluate()
 
-    def _one_tick(self, tick: int, state: RobotState) -> bool:
+    def _process_tick(self, tick: int, state: RobotState) -> bool:
         gate, measured = state.gate, state.velocity
         self._command = command = self._commands.get((tick, gate.commander), self._command)
         x, z = self._axes
@@ -178,13 +179,13 @@ class ActuationEstimator:
         x, z = self._axes
         if x.weight + z.weight < ENOUGH_TICKS:
             return
-        off = (DELAYS_S[:, None] - self._prior.delay) ** 2 + (LAGS_S - self._prior.lag) ** 2
-        cost = (x.cost() + z.cost()) / ALIKE + off / (2 * SPREAD_S**2)
-        likely = np.exp(cost.min() - cost)
-        likely /= likely.sum()
-        known = z.weight >= ENOUGH_TICKS
+        distance = (DELAYS_S[:, None] - self._prior.delay) ** 2 + (LAGS_S - self._prior.lag) ** 2
+        cost = (x.cost() + z.cost()) / CORRELATED_TICKS + distance / (2 * SPREAD_S**2)
+        weights = np.exp(cost.min() - cost)
+        weights /= weights.sum()
+        has_turned = z.weight >= ENOUGH_TICKS
         self._response = ActuationModel(
-            delay=float((likely * DELAYS_S[:, None]).sum()),
-            lag=float((likely * LAGS_S).sum()),
-            turn_gain=float((likely * z.gains()).sum()) if known else self._prior.turn_gain,
+            delay=float((weights * DELAYS_S[:, None]).sum()),
+            lag=float((weights * LAGS_S).sum()),
+            turn_gain=float((weights * z.gains()).sum()) if has_turned else self._prior.turn_gain,
         )

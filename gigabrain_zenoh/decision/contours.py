@@ -1,4 +1,4 @@
-"""Contours of cameras, as behaviours take them: what bars the way, beside what the scan shows."""
+"""Adds contours of cameras to the world model: obstacles that the scan does not show."""
 
 import logging
 import math
@@ -11,38 +11,38 @@ from gigabrain_schemas.brain import Contour, WorldModel
 from gigabrain_zenoh.config.settings import PerceptionConfig
 from gigabrain_zenoh.logs import Fault
 
-FARTHEST_M = 100.0  # of a corner from the body: no camera measures farther
-POINT_M = 0.05  # between the points of an edge that are looked at
+MAX_DISTANCE_M = 100.0  # from the body to a corner: no camera measures farther
+POINT_STEP_M = 0.05  # between sampled points of an edge
 MAX_EDGE_POINTS = 200
-AHEAD = PerceptionConfig()  # the cone and the strip that count as ahead, as of the scan
+AHEAD = PerceptionConfig()  # the same cone and strip count as ahead as for scans
 REFUSED = "refused_contours"
 log = logging.getLogger(__name__)
 
 
 class ContourFilter:
-    """Adds to each world what its contours mean for a body, and refuses impossible ones."""
+    """Merges contours into the world model, and refuses impossible ones."""
 
     def __init__(self, counters: Counter[str]) -> None:
         self._counters, self._fault = counters, Fault(log)
 
     def merged(self, world: WorldModel, body: BodyDescription | None) -> WorldModel:
-        """Return `world` with the contours that bar the way, also in what is ahead and around."""
+        """Return `world` with the contours that block the body, as in `with_contours`."""
         if not world.contours:
             return world
-        possible = [one for one in world.contours if _possible(one)]
+        possible = [contour for contour in world.contours if _possible(contour)]
         if refused := len(world.contours) - len(possible):
             self._counters[REFUSED] += refused
-            far = f"corners more than {FARTHEST_M:.0f} m from the body"
+            far = f"corners more than {MAX_DISTANCE_M:.0f} m from the body"
             self._fault.begin(f"refused {refused} contours with {far}; check perception")
         else:
             self._fault.end("all contours are possible again")
         height = body.body_height if body else math.inf
-        barring = tuple(one for one in possible if one.bottom < height)
-        return with_contours(replace(world, contours=barring), body)
+        blocking = tuple(contour for contour in possible if contour.bottom < height)
+        return with_contours(replace(world, contours=blocking), body)
 
 
 def _possible(contour: Contour) -> bool:
-    return all(math.hypot(x, y) <= FARTHEST_M for x, y in contour.polygon)
+    return all(math.hypot(x, y) <= MAX_DISTANCE_M for x, y in contour.polygon)
 
 
 def with_contours(world: WorldModel, body: BodyDescription | None) -> WorldModel:
@@ -55,8 +55,8 @@ def with_contours(world: WorldModel, body: BodyDescription | None) -> WorldModel
 
     front = max(x for x, _ in body.footprint)
     radius = max(math.hypot(x, y) for x, y in body.footprint)
-    polygons = [np.array(one.polygon) for one in world.contours]
-    x, y = points_on_edges(polygons, POINT_M, MAX_EDGE_POINTS).T
+    polygons = [np.array(contour.polygon) for contour in world.contours]
+    x, y = points_on_edges(polygons, POINT_STEP_M, MAX_EDGE_POINTS).T
     distance, bearing = np.hypot(x, y), np.arctan2(y, x)
     cone = (np.abs(bearing) <= math.radians(AHEAD.sector_deg) / 2) & (distance <= AHEAD.ahead)
     strip = (x > 0) & (x <= front + AHEAD.corridor)
@@ -64,14 +64,14 @@ def with_contours(world: WorldModel, body: BodyDescription | None) -> WorldModel
     ahead = distance[cone | strip]
     nearest = world.distance_ahead
     if ahead.size:
-        seen = float(ahead.min())
-        nearest = seen if nearest is None else min(seen, nearest)
+        closest = float(ahead.min())
+        nearest = closest if nearest is None else min(closest, nearest)
     sectors = list(world.sectors)
     if count := len(sectors):
         index = np.floor(bearing * (count / math.tau) + 0.5).astype(int) % count
         for sector in set(index.tolist()):
-            seen, before = float(distance[index == sector].min()), sectors[sector]
-            sectors[sector] = seen if before is None else min(seen, before)
+            closest, scanned = float(distance[index == sector].min()), sectors[sector]
+            sectors[sector] = closest if scanned is None else min(closest, scanned)
     return replace(
         world,
         obstacle_ahead=world.obstacle_ahead or ahead.size > 0,

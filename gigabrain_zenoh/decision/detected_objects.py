@@ -15,8 +15,8 @@ from gigabrain_zenoh.geometry.pose import PoseHistory, to_frame
 from gigabrain_zenoh.host.bounded import put_newest
 
 MAX_PERCEPTORS = 32
-RIM_M = 0.05  # between points on the rim of an object: no narrower than a cell of the planner
-MAX_RIM = 256  # points of one object
+RIM_STEP_M = 0.05  # between points on an object's rim: the planner's cells are not smaller
+MAX_RIM_POINTS = 256  # of one object
 ObjectsByPerceptor = Mapping[str, Objects]
 
 
@@ -36,24 +36,25 @@ class DetectedObjects:
         put_newest(self._newest, name, latest, MAX_PERCEPTORS)
 
     def observe(self, state: RobotState) -> None:
-        """Record the odometry; to be called with every state."""
+        """Record the odometry; called with every state."""
         self._history = self._history.then(state)
 
     def fresh(self) -> dict[str, Objects]:
-        """Return what perceptors have found lately, by perceptor; nothing of silent ones."""
+        """Return the newest objects by perceptor, without silent perceptors."""
         found = ((name, latest.fresh()) for name, latest in self._newest.items())
         return {name: objects for name, objects in found if objects}
 
     def merged(self, world: WorldModel) -> WorldModel:
-        """Return the world with the objects that are to be avoided among its hits and obstacles."""
+        """Return `world` with the objects marked `avoid` added to its hits and obstacles."""
         pose = self._history.at(world.boot, world.basis)
         return with_objects(world, pose, self.fresh()) if pose else world
 
 
 def with_objects(world: WorldModel, pose: Pose, found: ObjectsByPerceptor) -> WorldModel:
-    """Return `world`, at `pose`, with the objects to be avoided, moved to its tick.
+    """Return `world`, at `pose`, with the objects marked `avoid`, moved on to its tick.
 
-    The planner avoids what stands by the points on its rim, and what moves by its velocity as well.
+    Their rims become hits of the scan. They are obstacles as well, so that the planner uses their
+    velocities.
     """
     avoided = [
         _moved(one, (world.basis - objects.basis) * TICK_NS / 1e9)
@@ -73,14 +74,14 @@ def with_objects(world: WorldModel, pose: Pose, found: ObjectsByPerceptor) -> Wo
 
 
 def _moved(one: DetectedObject, seconds: float) -> DetectedObject:
-    """Return where an object is `seconds` later, at its present velocity."""
+    """Return an object moved on by `seconds`, at its current velocity."""
     x, y = one.x + one.velocity_x * seconds, one.y + one.velocity_y * seconds
     return replace(one, x=x, y=y)
 
 
 def _rim(one: DetectedObject, pose: Pose) -> list[tuple[float, float]]:
     """Return points on the rim of an object [m], in the frame of a body at `pose`."""
-    count = min(MAX_RIM, max(1, math.ceil(math.tau * one.radius / RIM_M)))
+    count = min(MAX_RIM_POINTS, max(1, math.ceil(math.tau * one.radius / RIM_STEP_M)))
     angles = (math.tau * i / count for i in range(count))
     return [
         to_frame(pose, one.x + one.radius * math.cos(a), one.y + one.radius * math.sin(a))

@@ -1,17 +1,17 @@
-"""Loads the kernels of planning and moving: those of all bodies, of cars, and of arms."""
+"""Loads the compiled kernels of planning and driving: for all bodies, for cars, and for arms."""
 
 from gigabrain_schemas.body import BodyDescription
 from gigabrain_zenoh.host.threads import InTime
 from gigabrain_zenoh.kernels.precompile import Kernels
 
-# each calls its kernels once
+# functions that call each of their kernels once
 DRIVE_KERNELS = "gigabrain_zenoh.decision.navigator:warm_up"
 CAR_KERNELS = "gigabrain_zenoh.navigation.car_planner:warm_up"
 ARM_KERNELS = "gigabrain_zenoh.manipulation.descent:warm_up"
 
 
 class DriveKernels:
-    """Loads the kernels that all bodies need, and those of a car or an arm once there is one."""
+    """Loads the kernels for all bodies, and those for cars and arms once the body needs them."""
 
     def __init__(self, in_time: InTime) -> None:
         self._for_all = Kernels(DRIVE_KERNELS, in_time)
@@ -19,10 +19,10 @@ class DriveKernels:
         self._for_arms = Kernels(ARM_KERNELS, in_time)
 
     async def load(self, *, wait: bool) -> bool:
-        """Load those that all bodies need, and return whether that is done.
+        """Load the kernels for all bodies, and return whether they are loaded.
 
-        Those that are still to be compiled compile meanwhile; with `wait`, all are compiled first.
-        Raises ConfigError if a package for them is not installed.
+        Missing ones are compiled in the background; with `wait`, before this returns. Raises
+        ConfigError if a package for them is not installed.
         """
         await self._for_all.load(wait=wait)
         if wait:
@@ -30,13 +30,13 @@ class DriveKernels:
         return not self._for_all.beside
 
     async def finish(self) -> None:
-        """Return once those that all bodies need are loaded. Raises ConfigError as above."""
+        """Wait until the kernels for all bodies are loaded. Raises ConfigError like `load`."""
         await self._for_all.finish()
 
     def loaded(self, body: BodyDescription | None) -> bool:
-        """Return whether all that `body` needs can be used from this scan on. Raises ConfigError.
+        """Return whether all kernels for `body` are loaded; start to load missing ones.
 
-        Begins to load what is missing.
+        Raises ConfigError.
         """
         if not self._for_all.loaded or body is None or body.drive_type != "ackermann":
             return self._for_all.loaded
@@ -44,7 +44,10 @@ class DriveKernels:
         return self._for_cars.loaded
 
     def arm_loaded(self) -> bool:
-        """Return whether what an arm needs can be used from this step on. Raises ConfigError."""
+        """Return whether the kernels for arms are loaded; start to load missing ones.
+
+        Raises ConfigError.
+        """
         self._for_arms.begin()
         return self._for_arms.loaded
 

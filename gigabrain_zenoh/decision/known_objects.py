@@ -1,4 +1,4 @@
-"""Things and tags in the map, as received from perception, and the nearest of those wanted."""
+"""Objects and tags in the map, received from perception, and the search for a wanted one."""
 
 import math
 from collections import deque
@@ -16,43 +16,48 @@ from gigabrain_zenoh.decision.zones import KEPT
 TAG_RADIUS_M = 0.02
 MIN_RADIUS_M, MAX_RADIUS_M = 0.02, 1.0
 NO_OBJECTS = ObjectMap()
-Wanted = str | int  # a class, or the number of a tag
+Wanted = str | int  # class of an object, or number of a tag
 
 
 @dataclass(frozen=True, kw_only=True)
 class Sought:
-    """The result of a search: the target, or None while there is none."""
+    """The result of a search; `target` is None if nothing wanted is known."""
 
     target: Target | None = None
     id: int = 0  # of the target
-    recognizing: bool = True  # so a thing that is looked at is found
+    recognizing: bool = True  # recognition runs, so that looking around can find an object
 
 
-Seek = Callable[[Wanted, Collection[int], int | None], Sought]  # without some ids; one preferred
+# arguments: wanted, ids to leave out, preferred id
+Seek = Callable[[Wanted, Collection[int], int | None], Sought]
 
 
 class ObjectSource:
-    """The newest map of objects, as it was before a tick: so a replay seeks the same."""
+    """The newest object map of before a tick, so that a replay finds the same objects."""
 
     def __init__(self, bus: Bus) -> None:
         self._bus = bus
         self._received: deque[ObjectMap] = deque(maxlen=KEPT)
-        self._watches = False
+        self._subscribed = False
 
     def observe(self, body: BodyDescription | None) -> None:
         """Subscribe once the body is known to have cameras."""
-        if body and body.cameras and not self._watches:
-            self._watches = True
+        if body and body.cameras and not self._subscribed:
+            self._subscribed = True
             self._bus.latest(OBJECT_MAP, self._received.append)
 
     @property
     def newest(self) -> ObjectMap:
-        """The objects that were received last."""
+        """The objects of the newest message."""
         return self._received[-1] if self._received else NO_OBJECTS
 
     def at(self, boot: int, tick: int) -> ObjectMap:
-        """Return the newest objects from before `tick`, or from an earlier run of the driver."""
-        earlier = (one for one in reversed(self._received) if one.boot != boot or one.tick < tick)
+        """Return the newest objects of before `tick`, or of an earlier start of the driver."""
+        earlier = (
+            objects
+            for objects in reversed(self._received)
+            if objects.boot != boot or objects.tick < tick
+        )
         oldest = self._received[0] if len(self._received) == KEPT else NO_OBJECTS
         return next(earlier, oldest)
 
@@ -64,17 +69,20 @@ def sought(
     without: Collection[int],
     preferred: int | None,
 ) -> Sought:
-    """Return the nearest of the wanted things, or the `preferred` one while it is there."""
-    there: list[MapObject | MapTag]
+    """Return the wanted object nearest to `here`, or the `preferred` one while it is known.
+
+    Objects with an id in `without` are left out.
+    """
+    found: list[MapObject | MapTag]
     if isinstance(wanted, int):
-        there = [one for one in known.tags if one.id == wanted and one.id not in without]
+        found = [one for one in known.tags if one.id == wanted and one.id not in without]
     else:
-        there = [one for one in known.objects if one.label == wanted and one.id not in without]
-    if not there:
+        found = [one for one in known.objects if one.label == wanted and one.id not in without]
+    if not found:
         return Sought(recognizing=known.recognizing)
-    x, y = (here.x, here.y) if here else (there[0].x, there[0].y)
+    x, y = (here.x, here.y) if here else (found[0].x, found[0].y)
     best = min(
-        there, key=lambda one: (one.id != preferred, math.hypot(one.x - x, one.y - y), one.id)
+        found, key=lambda one: (one.id != preferred, math.hypot(one.x - x, one.y - y), one.id)
     )
     return Sought(target=_target(best), id=best.id, recognizing=known.recognizing)
 
@@ -87,7 +95,7 @@ def _target(one: MapObject | MapTag) -> Target:
 
 
 def named(wanted: Wanted) -> str:
-    """Return what is wanted, for people."""
+    """Return the wanted object as text for users, such as `a can` or `tag 3`."""
     if isinstance(wanted, int):
         return f"tag {wanted}"
     return f"{'an' if wanted[:1].lower() in 'aeiou' else 'a'} {wanted}"

@@ -1,29 +1,30 @@
-"""Progress along the remaining path, to notice when there is none."""
+"""Detects that the robot makes no progress along its path."""
 
 import math
 
 PROGRESS_M = 0.3  # a smaller gain is no progress
-DETOUR_M = 1.0  # a path that is longer than the last plan by this is another way
-AT_GOAL_M = 0.05  # of path left where the robot only has to turn and stop
-MAX_TIMER_RESTARTS = 3  # for detours and arrivals, until the robot is nearer than ever
+DETOUR_M = 1.0  # a path that became longer by more than this is a detour
+AT_GOAL_M = 0.05  # with so little path left the robot only has to turn and stop
+MAX_TIMER_RESTARTS = 3  # for detours and arrivals, until the remaining path is a new minimum
 
 
 class ProgressMonitor:
-    """Measures for how long the remaining path has not become shorter.
+    """Measures the time since the remaining path last became shorter.
 
-    The timer restarts for a detour that has become necessary, and when the goal is reached, also
-    after giving way there.
+    The timer also restarts for a new detour, and whenever the goal is reached, as after giving way
+    there.
     """
 
     def __init__(self, tick: int) -> None:
         self._since_tick = tick  # of the last progress
-        self._best_m = self._nearest_m = self._remaining_m = math.inf  # ever, on this way, and now
+        # remaining path: the minimum, the minimum since the timer started, and the newest
+        self._best_m = self._nearest_m = self._remaining_m = math.inf
         self._restarts = 0
         self._was_held = False
 
     def measure(self, remaining_m: float, tick: int) -> None:
         """Record the length of the remaining path [m]."""
-        if self._was_held and remaining_m > self._remaining_m:  # an operator has driven it away
+        if self._was_held and remaining_m > self._remaining_m:  # an operator drove it away
             self._nearest_m += remaining_m - self._remaining_m
             self._best_m += remaining_m - self._remaining_m
         self._was_held = False
@@ -38,10 +39,10 @@ class ProgressMonitor:
             self._nearest_m, self._since_tick = remaining_m, tick
 
     def hold(self, ticks: int) -> None:
-        """Leave out `ticks` in which the robot could not follow the route."""
+        """Do not count `ticks` in which the robot could not follow the route."""
         self._since_tick += ticks
         self._was_held = self._was_held or ticks > 0
 
     def stuck(self, tick: int, ticks: int) -> bool:
-        """Return whether there has been no progress for more than `ticks`."""
+        """Return whether there was no progress for more than `ticks`."""
         return tick - self._since_tick > ticks

@@ -1,4 +1,4 @@
-"""Zones and places of the present map, as received from perception."""
+"""Zones and places of the current map, received from perception."""
 
 from collections import deque
 
@@ -10,11 +10,11 @@ from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.errors import Refused, unknown
 
 NO_ZONES = Zones()
-KEPT = 16  # messages that may be newer than the scan that is planned with
+KEPT = 16  # messages; some of them may be newer than the current scan
 
 
 class ZoneSource:
-    """The newest zones, also as they were before a tick: so a replay plans with the same ones."""
+    """The newest zones, and those from before a tick, so that a replay plans with the same ones."""
 
     def __init__(self, bus: Bus) -> None:
         self._received: deque[Zones] = deque(maxlen=KEPT)
@@ -22,7 +22,7 @@ class ZoneSource:
 
     @property
     def newest(self) -> Zones:
-        """The zones that were received last."""
+        """The zones of the newest message."""
         return self._received[-1] if self._received else NO_ZONES
 
     @property
@@ -31,7 +31,7 @@ class ZoneSource:
         return self._received[-1].maps_loaded if self._received else None
 
     def at(self, boot: int, tick: int) -> Zones:
-        """Return the newest zones from before `tick`, or from an earlier run of the driver."""
+        """Return the newest zones of before `tick`, or of an earlier start of the driver."""
         return self._before(boot, tick) or NO_ZONES
 
     def maps_loaded(self, boot: int, tick: int) -> int | None:
@@ -40,10 +40,10 @@ class ZoneSource:
         return found.maps_loaded if found else None
 
     def place(self, name: Name) -> Place:
-        """Return a place by its name. Raises Refused, with the names that would do."""
+        """Return a place by its name. Raises Refused, with the known names."""
         found = self.newest.place(name)
         if found is None:
-            known = [one.name for one in self.newest.places] or ["none"]
+            known = [place.name for place in self.newest.places] or ["none"]
             raise Refused(str(unknown("place", name, known)))
         return found
 
@@ -53,7 +53,9 @@ class ZoneSource:
         return Goal(x=place.x, y=place.y, yaw=place.yaw if yaw is None else yaw)
 
     def _before(self, boot: int, tick: int) -> Zones | None:
-        earlier = (one for one in reversed(self._received) if one.boot != boot or one.tick < tick)
+        earlier = (
+            zones for zones in reversed(self._received) if zones.boot != boot or zones.tick < tick
+        )
         oldest = self._received[0] if len(self._received) == KEPT else None
         return next(earlier, oldest)
 

@@ -1,7 +1,7 @@
-"""Behaviours: their inputs and outcomes, and how one is found by its name.
+"""Behaviours: their inputs and outcomes, and how they are loaded by name.
 
 A behaviour is one module: its class, its `Config`, and the parameters that may change while it
-runs. Packages offer theirs as entry points of the group `gigabrain.behaviours`.
+runs. Other packages offer behaviours as entry points of the group `gigabrain.behaviours`.
 """
 
 from collections.abc import Callable, Iterable, Mapping
@@ -34,19 +34,19 @@ SHIPPED = {  # name in a deployment file -> "module:class"
 NAVIGATION_PACKAGES = ("numba", "py_trees")
 
 SpeedLimit = Annotated[float, Meta(gt=0, le=10)]  # [m/s] or [rad/s]
-# `visit`: a random reachable place; `approach`: before a target; `look`: at what was not seen yet
+# `visit`: a random reachable place; `approach`: in front of a target; `look`: search unseen space
 DriveKind = Literal["goto", "explore", "visit", "approach", "look"]
 
 
 class Target(Struct, frozen=True, kw_only=True):
-    """A thing or a tag to drive before."""
+    """An object or tag to drive to."""
 
-    name: str  # for people, such as `can 3`
+    name: str  # shown to users, such as `can 3`
     x: float  # [m] in the map
     y: float  # [m]
     radius: float  # [m]
-    yaw: float | None = None  # [rad], where the face of a tag looks
-    away: float | None = None  # [m], from the body's middle to its own; None: a bit before it
+    yaw: float | None = None  # [rad], direction of a tag's normal
+    away: float | None = None  # [m], from the body's centre to the target's; None: a small gap
 
 
 class DriveCommand(Struct, frozen=True):
@@ -56,15 +56,15 @@ class DriveCommand(Struct, frozen=True):
     kind: DriveKind
     goal: Goal | None = None  # of `goto`
     target: Target | None = None  # of `approach`
-    seek: int = 0  # of `look`: which search it belongs to; a new one has seen nothing
+    seek: int = 0  # of `look`: number of the search; a new search starts with nothing seen
 
 
 class ArmCommand(Struct, frozen=True):
     """A request to move the arm."""
 
-    number: int  # as of a DriveCommand
+    number: int  # as in a DriveCommand
     do: ArmAction
-    things: Mapping[str, Solid]  # what stands round it
+    things: Mapping[str, Solid]  # around the arm
 
 
 Command = DriveCommand | ArmCommand
@@ -76,30 +76,30 @@ class StepOutcome(Struct, frozen=True, kw_only=True):
     number: int = 0  # of the command; 0 without one
     state: Literal["running", "done", "failed"] = "running"
     activity: str = ""  # short name of what the robot does; each change is logged
-    reason: str = ""  # for people
-    held: bool = False  # the body does not follow: the gate or an operator has it
+    reason: str = ""  # shown to users
+    held: bool = False  # the body ignores decision: the gate or an operator holds it
     progress: float = 0.0
     distance: float | None = None  # [m] left along the path
     eta: float | None = None  # [s]
-    goal: Goal | None = None  # present destination
+    goal: Goal | None = None  # current destination
     path: tuple[tuple[float, float], ...] = ()  # [m] in the map, for drawing
     position_error: float | None = None  # [m] from the requested place
     heading_error: float | None = None  # [rad] from the requested heading
     holds: Held | None = None  # what the gripper holds after a command that is done
-    placed: tuple[str, Solid] | None = None  # by this command: a thing, and where it was put down
-    approach: Target | None = None  # a thing that the body has to stand nearer to
-    seek: str = ""  # the class of a thing that it has to look for elsewhere
+    placed: tuple[str, Solid] | None = None  # thing that this command put down, with its new place
+    approach: Target | None = None  # thing that the body has to drive nearer to
+    seek: str = ""  # class of a thing to look for elsewhere
 
 
 class Idle(NamedTuple):
-    """The reason to stand: a short name, whose changes are logged, and a text for people."""
+    """A reason to stand still: a short name, whose changes are logged, and a text for users."""
 
     activity: str
     reason: str
 
 
 class WaitReason(StrEnum):
-    """Reasons why the robot cannot drive by its map yet; the value is the text for people."""
+    """Reasons why the robot cannot drive by its map yet; the value is the text for users."""
 
     STARTING = "starting up"
     PERCEPTION_STARTING = "perception is starting up"
@@ -123,21 +123,21 @@ class Inputs:
     must_charge: bool = False  # the battery is nearly empty
     objects: Mapping[str, Objects] = field(default_factory=dict)  # by perceptor, if fresh
     # for behaviours with a NavigationConfig:
-    command: DriveCommand | None = None  # what the task queue wants
+    command: DriveCommand | None = None  # of the task queue
     drive: Drive | None = None  # carries out a command: one step of the navigator
 
 
 class Behaviour(Protocol):
-    """Turns inputs into intents, one step per scan. It has its own memory, no clock and no bus."""
+    """Turns inputs into intents, one step per scan. It has a memory, but no clock and no bus."""
 
     Config: ClassVar[type[Struct]]  # a NavigationConfig, if it needs a map, goals and missions
-    PARAMS: ClassVar[Mapping[str, str]]  # fields of Config that may change, and what is expected
+    PARAMS: ClassVar[Mapping[str, str]]  # fields of Config that may change, and their valid values
     DEMO: ClassVar[Mapping[str, Any]]  # settings for a demonstration
 
     def __init__(self, config: Any) -> None: ...
 
     def configure(self, config: Any) -> None:
-        """Use other settings from now on, and keep the memory."""
+        """Replace the settings, and keep the memory."""
         ...
 
     def step(self, inputs: Inputs) -> StepResult:
@@ -149,16 +149,16 @@ class NavigationConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     """Settings of a behaviour that drives by a map; perception must have `mapping` on."""
 
     max_linear_speed: SpeedLimit | None = None  # [m/s]; the body's own limit applies too
-    # [m], how far beyond the body's own width obstacles are avoided where there is room; null: by
-    # the body's shape
+    # [m] beyond the body's width, in which obstacles are avoided where there is room; null: by the
+    # body's shape
     inflation: Annotated[float, Meta(ge=0.05, le=3.0)] | None = None
-    aggressiveness: Fraction = 0.5  # 0: gently, with more room; 1: faster where it is tight
+    aggressiveness: Fraction = 0.5  # 0: gentle, with more room; 1: faster in tight places
     # paths through unknown cells; with `allow` also to goals beyond the map
     unknown_space: Literal["avoid", "allow", "forbid"] = "avoid"
     samples: Annotated[int, Meta(ge=64, le=20_000)] = 1000  # candidate plans per scan
-    start: Literal["wait", "explore"] = "wait"  # explore, then visit places, until a task comes
-    mission: str = ""  # file of a mission to begin with instead; empty: none
-    scripts: str = ""  # folder of the programs that missions may run; empty: none
+    start: Literal["wait", "explore"] = "wait"  # explore, then visit places, until a task is added
+    mission: str = ""  # file of a mission to start with instead; empty: none
+    scripts: str = ""  # folder of programs that missions may run; empty: none
 
 
 class Navigate:
@@ -176,10 +176,10 @@ class Navigate:
         pass
 
     def configure(self, config: NavigationConfig) -> None:
-        """Keep nothing: the navigator has the settings."""
+        """Do nothing: the navigator keeps the settings."""
 
     def step(self, inputs: Inputs) -> StepResult:
-        """Carry out the present command."""
+        """Carry out the current command."""
         assert inputs.drive
         return inputs.drive(inputs.command)
 
@@ -211,7 +211,7 @@ def settings_of(config: DecisionConfig) -> Any:
 
 
 def check(config: DecisionConfig, path: Path | None = None) -> None:
-    """Raise ConfigError if the behaviour cannot run so; with the line in the file `path`."""
+    """Raise ConfigError if the behaviour cannot run with `config`; with the line in file `path`."""
     kind = load(config.behaviour).Config
     if path:
         loading.loads(loading.read(path), kind, str(path), at=("decision", "settings"))
@@ -243,20 +243,20 @@ def parse_settings(pairs: Iterable[str]) -> dict[str, Any]:
 
 
 def battery_nearly_empty(verdict: SafetyState | None) -> bool:
-    """Return whether safety wants the robot to come to rest and be charged."""
+    """Return whether safety requests that the robot stops and is charged."""
     return verdict is not None and any(w.code == "battery_return" for w in verdict.warnings)
 
 
 def describe_goal(goal: Goal) -> str:
     """Return a goal as text: `(x, y)` or `(x, y, yaw rad)`."""
-    turned = "" if goal.yaw is None else f", {goal.yaw:.2f} rad"
-    return f"({goal.x:.2f}, {goal.y:.2f}{turned})"
+    yaw = "" if goal.yaw is None else f", {goal.yaw:.2f} rad"
+    return f"({goal.x:.2f}, {goal.y:.2f}{yaw})"
 
 
 def describe_end(task: Task) -> str:
-    """Return how a task ended as text, with its reason and errors."""
+    """Return the end of a task as text, with its reason and errors."""
     if task.state == "cancelled":
-        return f"{task.id} was {task.reason or task.state}"  # its reason names the source
+        return f"{task.id} was {task.reason or task.state}"  # the reason names who cancelled it
     errors = []
     if task.position_error is not None:
         errors.append(f"position error {task.position_error:.2f} m")

@@ -12,8 +12,8 @@ from gigabrain_schemas.brain import Intent, TrajectoryPoint, WorldModel
 from gigabrain_zenoh.decision.behaviours import Inputs, SpeedLimit, StepOutcome, StepResult
 
 HORIZON_S, STEP_S = 2.0, 0.25  # of the expected trajectory
-MAX_LEG_M = 2.5  # expected length of a leg where nothing is in sight
-TURN_RAD = math.pi / 2  # expected length of a turn
+MAX_LEG_M = 2.5  # expected length of a straight leg without obstacles
+TURN_RAD = math.pi / 2  # expected angle of a turn
 
 
 class AvoidConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -46,7 +46,7 @@ class Avoid:
         self._progress = 0.0
 
     def configure(self, config: AvoidConfig) -> None:
-        """Use other settings; a turn that has begun keeps its side."""
+        """Replace the settings; a turn in progress keeps its side."""
         self._config = config
 
     def step(self, inputs: Inputs) -> StepResult:
@@ -83,11 +83,11 @@ class Avoid:
             self._begin(f"turning {side}", pose, TURN_RAD, side)
         turned = abs(math.remainder(pose.yaw - self._start.yaw, 2 * math.pi))
         sign = 1.0 if self._turn == "left" else -1.0
-        what = "obstacle"
+        obstacle = "obstacle"
         if world.distance_ahead is not None:
-            what = f"obstacle {world.distance_ahead:.2f} m ahead"
+            obstacle = f"obstacle {world.distance_ahead:.2f} m ahead"
         twist = Velocity(angular_z=sign * self._config.max_angular_speed)
-        return self._step(twist, turned, f"{self._activity}: {what}", activity=self._activity)
+        return self._step(twist, turned, f"{self._activity}: {obstacle}", activity=self._activity)
 
     def _side(self, world: WorldModel) -> Literal["left", "right"]:
         if self._config.turn != "clearer":
@@ -117,7 +117,7 @@ class Avoid:
 
 @lru_cache(maxsize=16)
 def expected_trajectory(twist: Velocity) -> tuple[TrajectoryPoint, ...]:
-    """Return the arc that a constant twist drives, in the body's present frame."""
+    """Return the arc of a constant twist, in the body's current frame."""
     v, w = twist.linear_x, twist.angular_z
     points = []
     for i in range(1, round(HORIZON_S / STEP_S) + 1):
