@@ -1,15 +1,15 @@
 """Lower bounds of the cost to a goal, from a search over blocks of cells. They guide A*.
 
-Corners of blocks of 4 x 4 cells are the vertices of a coarse grid, and a block costs what the
-cheapest of its 5 x 5 cells costs, those of its edges included. A step along an edge costs its
-length times the cheaper of the two blocks beside it; a diagonal step, its length times its block.
-The cheapest ways over that grid give the bounds at the vertices.
+The corners of blocks of 4 x 4 cells are the vertices of a coarse grid. The price of a block is the
+cost of the cheapest of its 5 x 5 cells, including those on its edges. A step along an edge costs
+its length times the lower price of the two blocks beside it. A diagonal step costs its length times
+the price of its block. The cheapest paths over that grid give the bounds at the vertices.
 
-Between the vertices: on the edges of a block, the middle gets the mean of its ends. The middle of
-the block gets the least value that differs from its eight neighbours by no more than a step in this
-block costs. That such a value exists follows from the differences of the four corners. So four
-blocks of half the size are bounded in the same way, down to cells. No step between cells costs less
-than the bound falls by it (A* calls this consistent), so no way costs less than the bound.
+Between vertices, the middle of an edge gets the mean of its ends. The middle of a block gets the
+least value that differs from its eight neighbours by at most the cost of a step in this block. Such
+a value exists because of the differences of the four corners. The four blocks of half the size are
+bounded in the same way, down to cells. No step between cells costs less than the decrease of the
+bound (A* calls this consistent). So no path costs less than the bound.
 """
 
 import math
@@ -23,16 +23,16 @@ from gigabrain_zenoh.kernels.jit import kernel, lean_kernel
 from gigabrain_zenoh.navigation.costmap import LETHAL, Costs
 
 DIAGONAL = math.sqrt(2.0)
-ROW_STEPS = (0, -1, -1, -1, 0, 1, 1, 1)  # by way: round the compass, the odd ones are diagonal
+ROW_STEPS = (0, -1, -1, -1, 0, 1, 1, 1)  # of the eight ways; odd ones are diagonal
 COLUMN_STEPS = (1, 1, 0, -1, -1, -1, 0, 1)
-BLOCK = 4  # cells a side
-SHIFT, WITHIN = 2, BLOCK - 1  # cell >> SHIFT is its block, cell & WITHIN its place in it
-BUCKETS = 4096  # in a ring: they hold more than any one step can add
+BLOCK = 4  # cells per side
+SHIFT, WITHIN = 2, BLOCK - 1  # cell >> SHIFT is its block, cell & WITHIN its index in the block
+BUCKETS = 4096  # in a ring that is longer than the most expensive step
 BUCKETS_PER_COST = 6.0
 ENTRIES_PER_VERTEX = 4
-BEYOND_RATIO, BEYOND = 1.06, 4.0  # how far beyond the start is searched: bounds are a bit low
-ROUNDED_DOWN = 1 - 2.0**-22  # of bounds in single precision
-UNSEEN, PRICED, BOUNDED = 0, 1, 2  # what is known of a block: nothing, its cost, its bounds
+BEYOND_RATIO, BEYOND = 1.06, 4.0  # factor and cost by which the search passes the start
+ROUNDED_DOWN = 1 - 2.0**-22  # keeps bounds in single precision below those in double
+UNSEEN, PRICED, BOUNDED = 0, 1, 2  # state of a block: nothing, its price, or its bounds are known
 NOWHERE = -1
 Ints = np.ndarray[tuple[int, ...], np.dtype[np.int32]]
 Cell = tuple[int, int]  # row, column
@@ -41,21 +41,21 @@ Cell = tuple[int, int]  # row, column
 class BlockBounds(NamedTuple):
     """Bounds of the cost to a goal, and the buffers to find them."""
 
-    vertex: Floats  # (rows, columns) of vertices, the bound there; inf where none is known
-    settled: Bytes  # likewise, 1 where it is final
-    price: Costs  # by block
+    vertex: Floats  # by vertex (row, column), its bound; inf if unknown
+    settled: Bytes  # by vertex, 1 if the bound is final
+    price: Costs  # by block (row, column)
     known: Bytes  # by block, see UNSEEN
-    bounds: Costs  # (block, cell in it)
-    corners: Floats  # (5, 5), of the block at work
+    bounds: Costs  # (block, cell in the block)
+    corners: Floats  # (5, 5), buffer for one block
     first: Ints  # by bucket, the entry on top
-    entries: Ints  # row, column, and the entry below
+    entries: Ints  # (3, n): row, column, and the entry below
     goal: Cell = (NOWHERE, NOWHERE)
-    limit: float = 0.0  # vertices that are not settled have at least this bound, less the distance
-    start: Cell = (0, 0)  # from here
+    limit: float = 0.0  # bound of vertices that are not settled: this minus their distance to start
+    start: Cell = (0, 0)
 
 
 def block_bounds(shape: tuple[int, ...]) -> BlockBounds:
-    """Return memory for a grid. What no search comes to is never touched, and costs nothing."""
+    """Return buffers for a grid. Pages that no search reaches take no memory."""
     rows, columns = ((max(side, 1) - 1) // BLOCK + 1 for side in shape)
     vertices = rows + 1, columns + 1
     entries = ENTRIES_PER_VERTEX * vertices[0] * vertices[1]
@@ -72,22 +72,22 @@ def block_bounds(shape: tuple[int, ...]) -> BlockBounds:
 
 
 def towards(goal: Cell, start: Cell, cost: Costs, memory: BlockBounds) -> BlockBounds:
-    """Return bounds of the cost to `goal`, close ones where ways from `start` may lead."""
-    limit = _spread(cost, start, goal, memory)
+    """Return bounds of the cost to `goal`, tight ones for paths from `start`."""
+    limit = _settle(cost, start, goal, memory)
     return memory._replace(goal=goal, limit=limit, start=start)
 
 
 @kernel
 def bound_after_changes(bound: BlockBounds, cost: Costs, start: Cell) -> float:
-    """Return the bound at `start`, if costs are not those any more from which bounds were computed.
+    """Return the bound at `start` when the costs have changed since the bounds were computed.
 
-    A way through blocks that have become cheaper costs at least its length to the last of them and
-    the bound where it leaves that. On all other ways the bounds hold.
+    A path through cheaper blocks costs at least its length to the last of them, plus the bound
+    where it leaves that block. For all other paths the bounds still hold.
     """
     least, known, price = bound_at(bound, cost, *start), bound.known, bound.price
     for row in range(known.shape[0]):
         for column in range(known.shape[1]):
-            if known[row, column] == UNSEEN or _least(cost, row, column) >= price[row, column]:
+            if known[row, column] == UNSEEN or _cheapest(cost, row, column) >= price[row, column]:
                 continue
             down = max(row * BLOCK - start[0], start[0] - (row + 1) * BLOCK, 0)
             right = max(column * BLOCK - start[1], start[1] - (column + 1) * BLOCK, 0)
@@ -105,30 +105,30 @@ def bound_at(bound: BlockBounds, cost: Costs, row: int, column: int) -> float:
     down, right = row >> SHIFT, column >> SHIFT
     block = down * bound.known.shape[1] + right
     if bound.known[down, right] != BOUNDED:
-        _fill(bound, cost, down, right, block)
+        _bound_cells(bound, cost, down, right, block)
     return float(bound.bounds[block, (row & WITHIN) * BLOCK + (column & WITHIN)])
 
 
 @lean_kernel
 def octile(down: float, right: float) -> float:
-    """Return the length of the shortest way over cells."""
+    """Return the length of the shortest path over cells."""
     down, right = abs(down), abs(right)
     return down + (DIAGONAL - 1) * right if down > right else right + (DIAGONAL - 1) * down
 
 
 @lean_kernel
 def _price(cost: Costs, bound: BlockBounds, row: int, column: int) -> float:
-    """Return the cost of a block; inf outside the grid."""
+    """Return the price of a block; inf outside the grid."""
     price, known = bound.price, bound.known
     if not (0 <= row < price.shape[0] and 0 <= column < price.shape[1]):
         return np.inf
     if known[row, column] == UNSEEN:
-        price[row, column], known[row, column] = _least(cost, row, column), PRICED
+        price[row, column], known[row, column] = _cheapest(cost, row, column), PRICED
     return float(price[row, column])
 
 
 @lean_kernel
-def _least(cost: Costs, row: int, column: int) -> np.float32:
+def _cheapest(cost: Costs, row: int, column: int) -> np.float32:
     """Return the cost of the cheapest cell of a block and its edges, LETHAL at most."""
     least, top, left = np.float32(LETHAL), row * BLOCK, column * BLOCK
     for y in range(top, min(top + BLOCK + 1, cost.shape[0])):
@@ -138,8 +138,8 @@ def _least(cost: Costs, row: int, column: int) -> np.float32:
 
 
 @kernel
-def _spread(cost: Costs, start: Cell, goal: Cell, bound: BlockBounds) -> float:
-    """Settle vertices from `goal` to a bit beyond `start`; return the `limit` of the bound."""
+def _settle(cost: Costs, start: Cell, goal: Cell, bound: BlockBounds) -> float:
+    """Settle vertices from `goal` to slightly beyond `start`; return the `limit` of the bounds."""
     vertex, settled, first, entries = bound.vertex, bound.settled, bound.first, bound.entries
     vertex[:], settled[:], bound.known[:], first[:] = np.inf, 0, UNSEEN, NOWHERE
     y, x = start[0] / BLOCK, start[1] / BLOCK
@@ -149,7 +149,7 @@ def _spread(cost: Costs, start: Cell, goal: Cell, bound: BlockBounds) -> float:
         row, column = (goal[0] >> SHIFT) + entry // 2, (goal[1] >> SHIFT) + entry % 2
         vertex[row, column] = 0.0
         key = int(BLOCK * octile(row - y, column - x) * BUCKETS_PER_COST)
-        _put(first, entries, entry, max(now, key), row, column)
+        _push(first, entries, entry, max(now, key), row, column)
     while count and now < limit:
         top = first[now % BUCKETS]
         if top == NOWHERE:
@@ -160,7 +160,7 @@ def _spread(cost: Costs, start: Cell, goal: Cell, bound: BlockBounds) -> float:
         if settled[row, column]:
             continue
         settled[row, column], base = 1, vertex[row, column]
-        if limit == np.inf and _around(settled, start):
+        if limit == np.inf and _corners_settled(settled, start):
             limit = now * BEYOND_RATIO + BEYOND * BUCKETS_PER_COST
         steps = _steps(cost, bound, row, column)
         for way in range(8):
@@ -176,20 +176,20 @@ def _spread(cost: Costs, start: Cell, goal: Cell, bound: BlockBounds) -> float:
             else:
                 return now / BUCKETS_PER_COST
             key = int((found + BLOCK * octile(down - y, right - x)) * BUCKETS_PER_COST)
-            _put(first, entries, entry, max(now, key), down, right)
+            _push(first, entries, entry, max(now, key), down, right)
             count += 1
     return now / BUCKETS_PER_COST if count else np.inf
 
 
 @lean_kernel
-def _put(first: Ints, entries: Ints, entry: int, bucket: int, row: int, column: int) -> None:
-    """Put `entry`, for a vertex, on top of a bucket."""
+def _push(first: Ints, entries: Ints, entry: int, bucket: int, row: int, column: int) -> None:
+    """Put `entry`, for vertex (row, column), on top of a bucket."""
     entries[0, entry], entries[1, entry] = row, column
     entries[2, entry], first[bucket % BUCKETS] = first[bucket % BUCKETS], entry
 
 
 @lean_kernel
-def _around(settled: Bytes, cell: Cell) -> bool:
+def _corners_settled(settled: Bytes, cell: Cell) -> bool:
     """Return whether all corners of the block of a cell are settled."""
     row, column = cell[0] >> SHIFT, cell[1] >> SHIFT
     return bool(
@@ -204,7 +204,7 @@ def _around(settled: Bytes, cell: Cell) -> bool:
 def _steps(
     cost: Costs, bound: BlockBounds, row: int, column: int
 ) -> tuple[float, float, float, float, float, float, float, float]:
-    """Return what steps from a vertex cost, by way; inf out of the grid."""
+    """Return the costs of the eight steps from a vertex; inf outside the grid."""
     one, across = float(BLOCK), BLOCK * DIAGONAL
     before, behind = _price(cost, bound, row - 1, column - 1), _price(cost, bound, row - 1, column)
     left, right = _price(cost, bound, row, column - 1), _price(cost, bound, row, column)
@@ -221,7 +221,7 @@ def _steps(
 
 
 @lean_kernel
-def _fill(bound: BlockBounds, cost: Costs, row: int, column: int, block: int) -> None:
+def _bound_cells(bound: BlockBounds, cost: Costs, row: int, column: int, block: int) -> None:
     """Compute the bounds of the cells of a block from those of its corners."""
     at, price = bound.corners, _price(cost, bound, row, column)
     for i in range(2):
@@ -232,7 +232,7 @@ def _fill(bound: BlockBounds, cost: Costs, row: int, column: int, block: int) ->
         half = side // 2
         for i in range(0, BLOCK, side):
             for j in range(0, BLOCK, side):
-                _halve(at, i, j, half, price)
+                _fill_middles(at, i, j, half, price)
         side = half
     for i in range(BLOCK):
         for j in range(BLOCK):
@@ -243,17 +243,17 @@ def _fill(bound: BlockBounds, cost: Costs, row: int, column: int, block: int) ->
 
 @lean_kernel
 def _at_vertex(bound: BlockBounds, row: int, column: int) -> float:
-    """Return the bound at a vertex; beyond those that are settled, by the way from the start."""
+    """Return the bound at a vertex; if it is not settled, by its distance from the start."""
     away = octile(row * BLOCK - bound.start[0], column * BLOCK - bound.start[1])
     found = min(bound.vertex[row, column], bound.limit - away)
     top, left = bound.goal[0] >> SHIFT, bound.goal[1] >> SHIFT
-    down = max(top - row, row - top - 1, 0)  # blocks between here and that of the goal
+    down = max(top - row, row - top - 1, 0)  # blocks between the vertex and the goal's
     right = max(left - column, column - left - 1, 0)
     return float(max(found, BLOCK * octile(down, right)))
 
 
 @lean_kernel
-def _halve(at: Floats, top: int, left: int, half: int, price: float) -> None:
+def _fill_middles(at: Floats, top: int, left: int, half: int, price: float) -> None:
     """Fill the middles of the edges of a block, and its middle, from its corners."""
     y, x, bottom, right = top + half, left + half, top + 2 * half, left + 2 * half
     a, b, c, d = at[top, left], at[top, right], at[bottom, left], at[bottom, right]

@@ -1,4 +1,4 @@
-"""Global planner of cars: from pose to pose, no tighter than they can turn, and in reverse."""
+"""Global planner of cars: from pose to pose, with their turning radius and in reverse."""
 
 import math
 
@@ -18,19 +18,19 @@ from gigabrain_zenoh.navigation.global_planner import NO_WAY, Path, Unreachable,
 from gigabrain_zenoh.navigation.grid_search import GridSearch
 from gigabrain_zenoh.navigation.reeds_shepp import SEGMENTS, TINY, along, best_word
 
-RADIUS_RESERVE = 1.1  # paths turn less than the car can, so that it can correct itself
-MAX_WIDER_M = 0.02  # [m], by which the discs over the car are wider than it
+RADIUS_FACTOR = 1.1  # of the turning radius of paths, so that the car can correct errors
+MAX_WIDER_M = 0.02  # by which the discs may extend beyond the sides of the car
 MAX_DISCS = 12
-FAR_M = 0.5  # [m] from obstacles; more makes no difference
-MAX_OFF_M = 0.2  # [m], a car that is farther off its path gets a new one
-GOAL_OFF_M, GOAL_OFF_RAD = 0.08, 0.08  # at the end of its path, within what counts as arrived
-SAME_END_M = 0.05  # [m] of path left: it is at its end
-MAX_SHIFT_M = 0.05  # [m], by which the map may have moved something towards path or goal
-SPARE_M = 0.01  # [m], less room than at the start is not enough near it
+FAR_M = 0.5  # larger distances to obstacles are not distinguished
+MAX_OFF_M = 0.2  # a car farther from its path gets a new one
+GOAL_OFF_M, GOAL_OFF_RAD = 0.08, 0.08  # errors at the end of a path that need no new one
+SAME_END_M = 0.05  # of remaining path, at which the car is at its end
+MAX_SHIFT_M = 0.05  # by which the map may move an obstacle towards path or goal
+SPARE_M = 0.01  # near the start, the car may have this much less room than there
 
 
 def car_of(body: BodyDescription) -> hybrid.Car:
-    """Return what a car needs, with the margins that safety keeps ahead, behind and beside it."""
+    """Return the shape of a car, including the margins that safety keeps around it."""
     edges, limits = sweep.box(body.footprint), body.thresholds
     front, rear = edges.front + limits.stop_margin, edges.rear - limits.stop_margin
     half = max(edges.left, -edges.right) + limits.side_margin
@@ -39,7 +39,7 @@ def car_of(body: BodyDescription) -> hybrid.Car:
         count += 1
     piece = length / count
     return hybrid.Car(
-        radius=RADIUS_RESERVE * body.turning_radius,
+        radius=RADIUS_FACTOR * body.turning_radius,
         first=rear + piece / 2,
         spacing=piece,
         discs=count,
@@ -49,17 +49,17 @@ def car_of(body: BodyDescription) -> hybrid.Car:
 
 
 class CarPlanner:
-    """Plans for one car after the other with the same memory. Not for two threads at once."""
+    """Plans for cars with the same buffers each time. It is not thread-safe."""
 
     def __init__(self) -> None:
         self._memory = hybrid.nodes()
         self._grid = GridSearch()
-        self._known: tuple[Costmap, Singles] | None = None  # a costmap, and its distances
+        self._distances: tuple[Costmap, Singles] | None = None  # of the last costmap
 
     def plan(
         self, costmap: Costmap, body: BodyDescription, start: Pose, goal: Goal
     ) -> Path | Unreachable:
-        """Return the cheapest path found to a goal, or why there is none."""
+        """Return the cheapest path found to a goal, or why none exists."""
         fault = goal_problem(costmap, (goal.x, goal.y))
         cell = costmap.cell(goal.x, goal.y)
         if fault or cell is None:
@@ -84,7 +84,7 @@ class CarPlanner:
     def replan(
         self, costmap: Costmap, body: BodyDescription, start: Pose, goal: Goal, path: Path
     ) -> Path | Unreachable:
-        """Return the rest of `path` while the car is on it and it is free; or a new one."""
+        """Return the rest of `path` if the car is on it and it is free, else a new path."""
         rest = rest_of(path, start, body.turning_radius)
         if rest is not None and self._is_free(costmap, body, rest):
             return rest
@@ -99,7 +99,7 @@ class CarPlanner:
         return bool((rooms[away > hybrid.LEAVE_M] >= car.room - MAX_SHIFT_M).all())
 
     def _terrain(self, costmap: Costmap, to_go: Floats) -> hybrid.Terrain:
-        if self._known is None or self._known[0] is not costmap:
+        if self._distances is None or self._distances[0] is not costmap:
             resolution = costmap.resolution
             cells = costmap.cells
             if costmap.inflation.unknown == "forbid":
@@ -108,9 +108,9 @@ class CarPlanner:
                 cells = np.maximum(cells, costmap.keepouts)
             squares = squared_distance(cells, math.ceil(FAR_M / resolution) + 1)
             distance = ((np.sqrt(squares) - 0.5) * resolution).astype(np.float32)
-            self._known = costmap, distance
+            self._distances = costmap, distance
         return hybrid.Terrain(
-            distance=self._known[1],
+            distance=self._distances[1],
             cost=costmap.cost,
             to_go=to_go,
             resolution=costmap.resolution,
@@ -119,7 +119,7 @@ class CarPlanner:
         )
 
     def _path(self, terrain: hybrid.Terrain, car: hybrid.Car, goal: hybrid.Pose, last: int) -> Path:
-        """Return the path that the links of the last search lead along."""
+        """Return the path to node `last` of the last search."""
         pose, g, link = self._memory.pose, self._memory.g, self._memory.link
         arcs: list[tuple[float, float]] = []  # curvature [1/m], length [m]
         node = last
@@ -150,7 +150,7 @@ class CarPlanner:
 def _needs(
     terrain: hybrid.Terrain, car: hybrid.Car, start: hybrid.Pose, goal: hybrid.Pose
 ) -> Floats | None:
-    """Return the room that the car needs, by place; None where it does not fit at the goal."""
+    """Return the required room, see `hybrid_astar.drive`; None if the goal is too tight."""
     at_start = hybrid.room_at(terrain, car, *start) - SPARE_M
     at_goal = car.room
     if not math.isnan(goal[2]):
@@ -191,7 +191,7 @@ def _sampled(start: hybrid.Pose, arcs: list[tuple[float, float]], cost: float) -
 
 
 def offsets(path: Path, here: Pose, radius: float) -> Floats:
-    """Return how far a car is from each pose of its path (n,) [m]; a turn counts as its arc."""
+    """Return the distance of a car to each pose of its path (n,) [m]; a turn counts as its arc."""
     assert path.headings is not None
     off = np.hypot(path.points[:, 0] - here.x, path.points[:, 1] - here.y)
     turn = path.headings[:, 0] - here.yaw
@@ -200,7 +200,7 @@ def offsets(path: Path, here: Pose, radius: float) -> Floats:
 
 
 def rest_of(path: Path, here: Pose, radius: float) -> Path | None:
-    """Return the rest of a path from the car on; None if it has strayed, or missed its end."""
+    """Return the rest of a path from the car on; None if the car left it or missed its end."""
     assert path.headings is not None
     off = offsets(path, here, radius)
     at = int(off.argmin())
@@ -228,7 +228,7 @@ CAR = BodyDescription(
 
 
 def warm_up() -> None:
-    """Compile all that planning for a car calls."""
+    """Compile all kernels of planning for cars."""
     cells = np.zeros((60, 60), np.int8)
     grid = OccupancyGrid(
         resolution=0.1, width=60, height=60, origin_x=0.0, origin_y=0.0, cells=cells.tobytes()

@@ -18,14 +18,14 @@ from gigabrain_zenoh.geometry import sweep
 from gigabrain_zenoh.kernels.images import Cells, Singles, squared_distance
 from gigabrain_zenoh.kernels.jit import kernel
 
-LETHAL = 100.0  # from here on the body does not fit; up to twice that where its centre touches
+LETHAL = 100.0  # the body does not fit at this cost or more; 200 if its centre touches an obstacle
 NEAR_COST = 12.0  # added where the body just fits
-UNKNOWN_COST = 4.0  # added in unknown space that is avoided: worth a detour of five times
-MIN_DECAY_M = 0.1  # [m]
-NEGLIGIBLE_COST = 0.05  # what of NEAR_COST may be left off at the end
-DECAYS = math.log(NEAR_COST / NEGLIGIBLE_COST)  # lengths of decay within the reach
-MAX_REACH_CELLS = 1000  # an obstacle costs nothing farther away; more would be too much to look at
-REDO_SHARE = 0.5  # of a map: if more of it has changed, all of it is computed
+UNKNOWN_COST = 4.0  # added in unknown space that is avoided: a free detour is up to 5 times as long
+MIN_DECAY_M = 0.1
+NEGLIGIBLE_COST = 0.05  # where the cost of obstacles is cut off
+DECAYS = math.log(NEAR_COST / NEGLIGIBLE_COST)  # decay lengths within the reach
+MAX_REACH_CELLS = 1000  # limit of the reach, and so of the time
+REDO_SHARE = 0.5  # if more of a map has changed, all of it is computed
 UNKNOWN_COSTS = {"allow": 0.0, "avoid": UNKNOWN_COST, "forbid": LETHAL}
 Unknown = Literal["avoid", "allow", "forbid"]
 Costs = NDArray[np.float32]
@@ -43,14 +43,14 @@ def no_problem(_x: float, _y: float) -> str:
 class Inflation:
     """Cost of obstacles and unknown space for one body."""
 
-    fits: float  # [m] from its centre to an obstacle, at least: it drives past
-    turns: float  # [m], at which it also turns on the spot
+    fits: float  # [m], distance of its centre to an obstacle at which it can drive past
+    turns: float  # [m], distance at which it can turn on the spot
     unknown: Unknown = "avoid"
-    beyond: float | None = None  # [m] past `fits`, where obstacles still cost; None: by the shape
+    beyond: float | None = None  # [m] past `fits`, at which obstacles cost nothing; None: by shape
 
     @property
     def decay(self) -> float:
-        """Over how many metres the cost falls to 1/e."""
+        """The decay length of the cost [m]."""
         if self.beyond is not None:
             return self.beyond / DECAYS
         return max(MIN_DECAY_M, self.turns - self.fits)
@@ -67,7 +67,7 @@ class ZoneOverlay:
 
     cost: Costs | None  # (height, width), least cost of each cell; None without keep-out zones
     keepouts: Cells | None  # (height, width), 100 in keep-out zones; None without any
-    against: WayBits  # (height, width), by cell the ways that lanes forbid; (0, 0) without lanes
+    against: WayBits  # (height, width), ways that lanes forbid in each cell; (0, 0) without lanes
     problem: Callable[[float, float], str]  # why the body must not be at (x, y) [m], or ""
 
 
@@ -79,14 +79,14 @@ class Costmap:
     origin_x: float  # [m], of the corner of cell (0, 0)
     origin_y: float  # [m]
     inflation: Inflation
-    cells: Cells  # (height, width): the map's, with extra obstacles in it
+    cells: Cells  # (height, width), the map with additional obstacles
     cost: Costs  # (height, width)
     against: WayBits = field(default_factory=lambda: NO_LANES)  # see ZoneOverlay
-    zone_problem: Callable[[float, float], str] = no_problem  # likewise
-    keepouts: Cells | None = None  # likewise
+    zone_problem: Callable[[float, float], str] = no_problem  # see ZoneOverlay.problem
+    keepouts: Cells | None = None  # see ZoneOverlay
 
     def cell(self, x: float, y: float) -> tuple[int, int] | None:
-        """Row and column at (x, y) [m]; None outside the map, and for what is not a number."""
+        """Return row and column at (x, y) [m]; None outside the map, and for nan."""
         column, row = (x - self.origin_x) / self.resolution, (y - self.origin_y) / self.resolution
         height, width = self.cost.shape
         if not (0 <= row < height and 0 <= column < width):
@@ -105,7 +105,7 @@ def inflation(
 ) -> Inflation:
     """Return the inflation for `body`, including the side margin that safety keeps.
 
-    Obstacles cost something up to `beyond` [m] farther than the body needs; None: by its shape.
+    Obstacles have a cost up to `beyond` [m] farther than the body needs; None: by its shape.
     """
     edges, margin = sweep.box(body.footprint), body.thresholds.side_margin
     aside, ahead = max(edges.left, -edges.right), max(edges.front, -edges.rear)
@@ -125,11 +125,11 @@ def costmap(
 ) -> Costmap:
     """Return the costs of `grid`; `points` [m], (n, 2) in the map's frame, are obstacles too.
 
-    With the costmap `before` only changed parts are computed; the result is the same. With `reuse`
-    they are written into the costs of `before`, which must not be used any more.
+    With the costmap `before`, only changed parts are computed, with the same result. With `reuse`,
+    they are written into the costs of `before`, which must not be used afterwards.
     """
     cells = _with_points(grid, points)
-    box = _box_to_renew(before, grid, rules, cells)
+    box = _box_to_update(before, grid, rules, cells)
     if box is None or before is None:
         cost = np.empty(cells.shape, np.float32)
         _fill(cost, cells, rules, grid.resolution, (0, cells.shape[0], 0, cells.shape[1]))
@@ -149,7 +149,7 @@ def costmap(
 
 
 def with_zones(costs: Costmap, overlay: ZoneOverlay | None) -> Costmap:
-    """Return `costs` with zones in them."""
+    """Return `costs` with the zones of `overlay`."""
     if overlay is None:
         return costs
     cost = costs.cost if overlay.cost is None else np.maximum(costs.cost, overlay.cost)
@@ -160,9 +160,9 @@ def with_zones(costs: Costmap, overlay: ZoneOverlay | None) -> Costmap:
 
 
 def clearance_costs(occupied: Cells, rules: Inflation, resolution: float) -> Costs:
-    """Return costs (height, width) by the distance to `occupied` cells, LETHAL at most."""
+    """Return costs (height, width) by distance to `occupied` cells, LETHAL at most."""
     reach = _reach_cells(rules, resolution)
-    table = np.minimum(_table(rules, resolution, reach), np.float32(LETHAL))
+    table = np.minimum(_cost_table(rules, resolution, reach), np.float32(LETHAL))
     costs: Costs = table[squared_distance(occupied, reach).astype(np.int32)]
     return costs
 
@@ -177,7 +177,7 @@ def _with_points(grid: OccupancyGrid, points: NDArray[np.floating] | None) -> Ce
     return cells
 
 
-def _box_to_renew(
+def _box_to_update(
     before: Costmap | None, grid: OccupancyGrid, rules: Inflation, cells: Cells
 ) -> Box | None:
     """Return the part of the map whose cost may differ from `before`; None for all of it."""
@@ -189,10 +189,10 @@ def _box_to_renew(
         before.origin_y,
     ):
         return None
-    top, bottom, left, right = _changed(before.cells, cells)
+    top, bottom, left, right = _changed_box(before.cells, cells)
     if top == bottom:
         return top, bottom, left, right
-    box = _wider((top, bottom, left, right), _reach_cells(rules, grid.resolution), cells.shape)
+    box = _widened((top, bottom, left, right), _reach_cells(rules, grid.resolution), cells.shape)
     large = (box[1] - box[0]) * (box[3] - box[2]) > REDO_SHARE * cells.size
     return None if large else box
 
@@ -201,7 +201,7 @@ def _reach_cells(rules: Inflation, resolution: float) -> int:
     return min(math.ceil(rules.reach / resolution + 0.5), MAX_REACH_CELLS)
 
 
-def _wider(box: Box, by: int, shape: tuple[int, ...]) -> Box:
+def _widened(box: Box, by: int, shape: tuple[int, ...]) -> Box:
     top, bottom, left, right = box
     return (
         max(top - by, 0),
@@ -212,19 +212,19 @@ def _wider(box: Box, by: int, shape: tuple[int, ...]) -> Box:
 
 
 def _fill(cost: Costs, cells: Cells, rules: Inflation, resolution: float, box: Box) -> None:
-    """Compute the cost of `box`. Obstacles beyond it count as far as they reach."""
+    """Compute the cost of `box`, with the obstacles around it that reach into it."""
     reach = _reach_cells(rules, resolution)
-    wide = _wider(box, reach, cells.shape)
+    wide = _widened(box, reach, cells.shape)
     part = np.ascontiguousarray(cells[wide[0] : wide[1], wide[2] : wide[3]])
-    squares, table = squared_distance(part, reach), _table(rules, resolution, reach)
+    squares, table = squared_distance(part, reach), _cost_table(rules, resolution, reach)
     unknown = np.float32(UNKNOWN_COSTS[rules.unknown])
-    _look_up(cells, (squares, wide), (table, unknown), box, cost)
+    _fill_box(cells, (squares, wide), (table, unknown), box, cost)
 
 
-def _table(rules: Inflation, resolution: float, reach: int) -> Costs:
+def _cost_table(rules: Inflation, resolution: float, reach: int) -> Costs:
     """Return the cost by the squared distance in cells to the nearest obstacle.
 
-    Distances are between centres; the obstacle's cell may be full up to its edge.
+    Distances are between centres. Half a cell is subtracted, as an obstacle may fill its cell.
     """
     away = (np.sqrt(np.arange(reach * reach + 1)) - 0.5).clip(0) * resolution
     near = 1 + NEAR_COST * np.exp(-(away - rules.fits) / rules.decay)
@@ -235,14 +235,14 @@ def _table(rules: Inflation, resolution: float, reach: int) -> Costs:
 
 
 @kernel
-def _look_up(
+def _fill_box(
     cells: Cells,
     squares_in_box: tuple[Singles, Box],
     prices: tuple[Costs, np.float32],
     box: Box,
     out: Costs,
 ) -> None:
-    """Fill `box` of `out` by squared distances, at `prices` by square and of unknown space."""
+    """Fill `box` of `out`; `prices` are the costs by squared distance, and of unknown space."""
     (squares, wide), (table, unknown) = squares_in_box, prices
     lethal = np.float32(LETHAL)
     for row in range(box[0], box[1]):
@@ -254,13 +254,13 @@ def _look_up(
 
 
 @kernel
-def _changed(before: Cells, now: Cells) -> Box:
-    """Return the smallest box with all cells that differ; empty without any."""
+def _changed_box(before: Cells, now: Cells) -> Box:
+    """Return the smallest box that contains all cells that differ; empty if none does."""
     height, width = now.shape
     top, bottom, left, right = height, 0, width, 0
     for row in range(height):
         one, other, differs = before[row], now[row], np.uint8(0)
-        for column in range(width):  # without a branch it is vectorised
+        for column in range(width):  # vectorised, as it has no branch
             differs = np.uint8(differs | np.uint8(one[column] ^ other[column]))
         if not differs:
             continue

@@ -20,39 +20,39 @@ from gigabrain_zenoh.navigation.grid_search import (
     smooth_path,
 )
 
-POINT_SPACING_M = 0.1  # [m] between the points of a path, at most
-MAX_STRAY_M = 0.5  # [m] off its path, beyond which it is planned again
-SWITCH_COST_RATIO = 0.85  # of the present path's cost, above which a new path is not taken
-LONG_PATH_M = 20.0  # [m], from which a path is led round what blocks it: a search takes longer
-DETOUR_M = 3.0  # [m] around what blocks a path: that part of the map is searched again
-MAX_DETOUR_M = 15.0  # [m] of a path that are replaced, at most
-MAX_DETOUR_OF_CELLS = math.sqrt(4 - 2 * math.sqrt(2))  # of steps between cells, over straight lines
+MAX_POINT_SPACING_M = 0.1  # between points of a path
+MAX_STRAY_M = 0.5  # distance from its path beyond which the robot gets a new one
+SWITCH_COST_RATIO = 0.85  # of the present path's cost, which a new path must be below
+LONG_PATH_M = 20.0  # from this length on, a blocked path gets a detour instead of a new search
+DETOUR_M = 3.0  # margin of the searched part of the map around the blocked part of a path
+MAX_DETOUR_M = 15.0  # length of a path that a detour replaces
+MAX_CELL_PATH_RATIO = math.sqrt(4 - 2 * math.sqrt(2))  # of steps between cells to a straight line
 Point = tuple[float, float]  # [m], in the map's frame
 NO_WAY = "no way leads to the goal"
 
-BLACKLIST_RADIUS_M = 0.5  # [m]: what is nearer to a place of the blacklist does not count
-SIZE_GAIN = 1.0  # a metre of frontier is worth a metre of way
-MAX_SIZE_M = 4.0  # [m] of frontier count
+BLACKLIST_RADIUS_M = 0.5  # frontiers nearer to a blacklisted point are ignored
+SIZE_GAIN = 1.0  # metres of path that a metre of frontier is worth
+MAX_SIZE_M = 4.0  # a larger frontier counts as this size
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Path:
-    """A way to a goal, in the map's frame."""
+    """A path to a goal, in the map's frame."""
 
-    points: Floats  # (n, 2) [m], from where the robot is to the goal
-    remaining: Floats  # (n,) [m] from each to the goal
-    cost: Floats  # (n,) the same, weighted: metres in the open
+    points: Floats  # (n, 2) [m], from the robot to the goal
+    remaining: Floats  # (n,) [m], distance from each point to the goal
+    cost: Floats  # (n,) [m in the open], cost from each point to the goal
     headings: Floats | None = None
-    # (n, 2), of a car: its heading [rad], and 1 where it drives on to there, -1 where it reverses
+    # (n, 2), of a car: its heading [rad], and 1 if it arrives forwards, -1 in reverse
 
 
 @dataclass(frozen=True, kw_only=True)
 class Unreachable:
-    """A goal that no way leads to: why, and how near the robot could come."""
+    """The reason why a goal is unreachable, and the nearest reachable place."""
 
-    fault: str  # for people, without the nearest place
+    fault: str  # text for people, without the nearest place
     nearest: Point | None = None
-    distance: float = math.inf  # [m] from there to the goal, straight
+    distance: float = math.inf  # [m], from the nearest place to the goal
 
     @property
     def reason(self) -> str:
@@ -64,14 +64,14 @@ class Unreachable:
 
 
 class GlobalPlanner:
-    """Plans with the same memory again and again. Not for two threads at once."""
+    """Plans with the same buffers each time. It is not thread-safe."""
 
     def __init__(self) -> None:
         self.search = GridSearch()
-        self._nearby = GridSearch()  # in a part of the map
+        self._nearby = GridSearch()  # for parts of the map
 
     def plan(self, costmap: Costmap, start: Point, goal: Point) -> Path | Unreachable:
-        """Return the cheapest path from `start` to `goal`, or why there is none."""
+        """Return the cheapest path from `start` to `goal`, or why none exists."""
         if not all(math.isfinite(value) for value in (*start, *goal)):
             return Unreachable(fault="the goal and the robot's place must be finite numbers")
         begin, end = costmap.cell(*start), costmap.cell(*goal)
@@ -84,12 +84,12 @@ class GlobalPlanner:
         cells = self.search.path(costmap.cost, begin, end, costmap.against)
         if cells is None:
             return self._nearest(costmap, goal, NO_WAY)
-        return _path(costmap, _pulled_tight(costmap, cells, np.array((start, goal))))
+        return _path(costmap, _smoothed(costmap, cells, np.array((start, goal))))
 
     def replan(self, costmap: Costmap, start: Point, goal: Point, path: Path) -> Path | Unreachable:
-        """Return the rest of `path` if it is free and no path is much cheaper; or a new one.
+        """Return the rest of `path` if it is free and no path is much cheaper, else a new path.
 
-        A long path that is blocked is led round what blocks it, if no path is much cheaper.
+        A long path that is blocked gets a detour, if no path is much cheaper.
         """
         rest = remaining_path(path, costmap, start)
         if rest is None or tuple(path.points[-1]) != goal:
@@ -98,17 +98,17 @@ class GlobalPlanner:
         kept = rest if free else self._detour(costmap, rest)
         if kept is None:
             return self.plan(costmap, start, goal)
-        worthwhile = SWITCH_COST_RATIO * kept.cost[0]
-        if self._costs_at_least(worthwhile, costmap, start, goal):
+        switch_cost = SWITCH_COST_RATIO * kept.cost[0]
+        if self._costs_at_least(switch_cost, costmap, start, goal):
             return kept
         found = self.plan(costmap, start, goal)
-        better = isinstance(found, Path) and found.cost[0] < worthwhile
+        better = isinstance(found, Path) and found.cost[0] < switch_cost
         return found if better or not free else kept
 
     def field(self, costmap: Costmap, goal: Point) -> Floats | None:
         """Return the cost from each cell to `goal`, (height, width) [m in the open].
 
-        None for a goal outside the map; inf where no way leads to it.
+        It is None for a goal outside the map, and inf where no path leads to it.
         """
         cell = costmap.cell(*goal)
         if cell is None:
@@ -116,7 +116,7 @@ class GlobalPlanner:
         return self.search.field(costmap.cost, cell, "to", costmap.against) * costmap.resolution
 
     def _detour(self, costmap: Costmap, path: Path) -> Path | None:
-        """Return a long path led round what blocks it; None if that does not work nearby."""
+        """Return a long path with a detour round its blocked part; None if none is found nearby."""
         stretch = _blocked_stretch(costmap, path)
         if stretch is None:
             return None
@@ -130,22 +130,22 @@ class GlobalPlanner:
         cells = self._nearby.path(costmap.cost[part], (row, column), (to_row, to_column), against)
         if cells is None:
             return None
-        corners = _pulled_tight(costmap, cells + low, path.points[[begin, end]])
-        led = np.vstack((path.points[:begin], corners, path.points[end + 1 :]))
-        detour = _path(costmap, led)
+        corners = _smoothed(costmap, cells + low, path.points[[begin, end]])
+        points = np.vstack((path.points[:begin], corners, path.points[end + 1 :]))
+        detour = _path(costmap, points)
         return detour if is_valid(detour, costmap) else None
 
     def _costs_at_least(self, least: float, costmap: Costmap, start: Point, goal: Point) -> bool:
-        """Return whether it is sure that no path is cheaper [m in the open]."""
+        """Return whether bounds show that no path costs less than `least` [m in the open]."""
         begin, end = costmap.cell(*start), costmap.cell(*goal)
         if begin is None or end is None:
             return False
-        ends = float(costmap.cost[begin] + costmap.cost[end])  # searched are ways between centres
-        cells = least / costmap.resolution * MAX_DETOUR_OF_CELLS + ends
+        ends = float(costmap.cost[begin] + costmap.cost[end])  # from start and goal to cell centres
+        cells = least / costmap.resolution * MAX_CELL_PATH_RATIO + ends
         return self.search.costs_at_least(cells, costmap.cost, begin, end)
 
     def _nearest(self, costmap: Costmap, goal: Point, why: str) -> Unreachable:
-        """Return the place nearest to `goal` among the cells of the last search."""
+        """Return the cell of the last search that is nearest to `goal`, with the reason `why`."""
         column, row = _in_cells(costmap, np.array((goal,)))[0] - 0.5
         cell = self.search.nearest(costmap.cost, row, column)
         if cell is None:
@@ -156,12 +156,12 @@ class GlobalPlanner:
 
 
 def _blocked_stretch(costmap: Costmap, path: Path) -> tuple[int, int] | None:
-    """Return the points of a long path between which it has to lead elsewhere, if they are near."""
+    """Return the first and last point of the stretch that a detour replaces; None without one."""
     if path.remaining[0] < LONG_PATH_M:
         return None
     rows, columns = _cells_of(costmap, path.points).T
     blocked = path.remaining[costmap.cost[rows, columns] >= LETHAL]
-    if not len(blocked):  # but between two points
+    if not len(blocked):  # it is blocked between two points
         return None
     before = int(np.count_nonzero(path.remaining >= blocked[0] + DETOUR_M))
     until = int(np.count_nonzero(path.remaining > blocked[-1] - DETOUR_M))
@@ -171,18 +171,18 @@ def _blocked_stretch(costmap: Costmap, path: Path) -> tuple[int, int] | None:
 
 
 def _cells_of(costmap: Costmap, points: Floats) -> NDArray[np.intp]:
-    """Return the rows and columns (n, 2) of points (n, 2) [m]; of the nearest cells, if outside."""
+    """Return rows and columns (n, 2) of points (n, 2) [m], limited to the map."""
     inside = np.array(costmap.cost.shape) - 1
     return _in_cells(costmap, points)[:, ::-1].astype(np.intp).clip(0, inside)
 
 
-def _pulled_tight(costmap: Costmap, cells: NDArray[np.integer], ends: Floats) -> Floats:
-    """Return the corners (n, 2) [m] of a path over `cells` (m, 2), between two `ends` (2, 2)."""
+def _smoothed(costmap: Costmap, cells: NDArray[np.integer], ends: Floats) -> Floats:
+    """Return the corners (n, 2) [m] of a path over `cells` (m, 2), from `ends[0]` to `ends[1]`."""
     places = np.column_stack((cells[:, 1] + 0.5, cells[:, 0] + 0.5))
     places = np.vstack((places[:1], places)) if len(places) == 1 else places
     places[[0, -1]] = _in_cells(costmap, ends)
     corners = _in_metres(costmap, smooth_path(costmap.cost, places, costmap.against))
-    corners[[0, -1]] = ends  # exactly
+    corners[[0, -1]] = ends  # without rounding errors
     return corners
 
 
@@ -192,7 +192,7 @@ def is_valid(path: Path, costmap: Costmap) -> bool:
 
 
 def remaining_path(path: Path, costmap: Costmap, start: Point) -> Path | None:
-    """Return the rest of `path` from the robot on; None if the robot has strayed from it."""
+    """Return the rest of `path` from the robot on; None if the robot is too far from it."""
     begin, end = path.points[:-1], path.points[1:]
     along = end - begin
     lengths = (along**2).sum(axis=1)
@@ -206,7 +206,7 @@ def remaining_path(path: Path, costmap: Costmap, start: Point) -> Path | None:
 
 
 def warm_up() -> None:
-    """Compile all that planning calls: it takes seconds, or a moment where it is kept."""
+    """Compile all kernels of planning. It takes seconds, unless they are cached."""
     cells = np.zeros((40, 40), np.int8)
     rules = Inflation(fits=0.1, turns=0.2)
     planner = GlobalPlanner()
@@ -224,7 +224,7 @@ def warm_up() -> None:
 
 
 def goal_problem(costmap: Costmap, goal: Point) -> str:
-    """Return why the body cannot be at a goal, or an empty text."""
+    """Return why the body cannot be at the goal, or an empty text."""
     cell = costmap.cell(*goal)
     if cell is None:
         return "the goal is outside the map"
@@ -241,7 +241,7 @@ def goal_problem(costmap: Costmap, goal: Point) -> str:
 
 
 def _path(costmap: Costmap, corners: Floats) -> Path:
-    """Return the path along straight lines between `corners` (n, 2) [m]."""
+    """Return the path of straight lines between `corners` (n, 2) [m]."""
     points = _resampled(corners)
     steps = np.hypot(*np.diff(points, axis=0).T)
     remaining = np.append(np.cumsum(steps[::-1])[::-1], 0.0)
@@ -252,9 +252,9 @@ def _path(costmap: Costmap, corners: Floats) -> Path:
 
 
 def _resampled(corners: Floats) -> Floats:
-    """Return points (n, 2) along straight lines, all corners among them."""
+    """Return points (n, 2) along straight lines, including all corners."""
     lengths = np.hypot(*np.diff(corners, axis=0).T)
-    counts = np.maximum(np.ceil(lengths / POINT_SPACING_M).astype(np.intp), 1)
+    counts = np.maximum(np.ceil(lengths / MAX_POINT_SPACING_M).astype(np.intp), 1)
     first = np.concatenate(([0], np.cumsum(counts)))
     at = np.arange(first[-1] + 1)
     return np.column_stack([np.interp(at, first, values) for values in corners.T])
@@ -272,12 +272,12 @@ def _in_metres(costmap: Costmap, places: Floats) -> Floats:
 
 @dataclass(frozen=True, kw_only=True)
 class Frontier:
-    """A piece of the edge of the known, as wide as the body, and reachable through the known."""
+    """A border of known space, at least as wide as the body, reachable through known space."""
 
-    x: float  # [m], of its cell nearest to its middle
+    x: float  # [m], of the cell nearest to the middle
     y: float  # [m]
     size: float  # [m]
-    cost: float  # [m in the open] to get there
+    cost: float  # [m in the open], from the robot
 
     @property
     def score(self) -> float:
@@ -290,8 +290,8 @@ def next_frontier(
 ) -> Frontier | None:
     """Return the best frontier; None when everything reachable is explored.
 
-    The blacklist holds places that the robot failed to reach, and those it has visited: unknown
-    space there stays unknown.
+    The blacklist holds places that the robot could not reach, and visited places where unknown
+    space remains.
     """
     return min(
         frontiers(costmap, robot, blacklist, search), key=lambda one: one.score, default=None
@@ -301,13 +301,13 @@ def next_frontier(
 def frontiers(
     costmap: Costmap, robot: Point, blacklist: Iterable[Point], search: GridSearch
 ) -> list[Frontier]:
-    """Return all frontiers that count, seen from `robot` [m]."""
+    """Return all reachable frontiers that are wide enough, except those near the blacklist."""
     start = costmap.cell(*robot)
     if start is None:
         return []
     known = np.where(costmap.cells < 0, np.float32(LETHAL), costmap.cost)
     way = search.field(known, start, "from", costmap.against) * costmap.resolution
-    edge = _edge(costmap.cells) & (known < LETHAL) & np.isfinite(way)
+    edge = _frontier_cells(costmap.cells) & (known < LETHAL) & np.isfinite(way)
     for x, y in blacklist:
         _erase_around(edge, costmap, x, y)
     cells, begins = connected_parts(edge)
@@ -332,7 +332,7 @@ def _frontier(
     return Frontier(x=float(x), y=float(y), size=size, cost=float(way[rows[best], columns[best]]))
 
 
-def _edge(cells: NDArray[np.int8]) -> NDArray[np.bool_]:
+def _frontier_cells(cells: NDArray[np.int8]) -> NDArray[np.bool_]:
     """Return the known cells next to an unknown one; outside the map counts as unknown."""
     unknown = np.pad(cells < 0, 1, constant_values=True)
     beside = unknown[:-2, 1:-1] | unknown[2:, 1:-1] | unknown[1:-1, :-2] | unknown[1:-1, 2:]

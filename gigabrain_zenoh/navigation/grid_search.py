@@ -1,10 +1,10 @@
 """Cheapest paths over a cost grid, eight-connected (A*, Dijkstra), and their smoothing.
 
 A step costs its length in cells times the mean cost of both cells. Corners are not cut. From cells
-of cost LETHAL or more a path may lead to lower cost only, so that a body too close to something
-can leave. One-way lanes forbid some of the eight ways in their cells. A* is guided by the bounds of
-`block_bounds`. Open cells lie in buckets by total cost, in half the time of a heap. Smoothing keeps
-straight lines that cost no more than the cells.
+of cost LETHAL or more a path may only lead to lower cost, so that a body too close to an obstacle
+can leave. One-way lanes forbid some of the eight ways in their cells. The bounds of `block_bounds`
+guide A*. Open cells are in buckets by total cost, which takes half the time of a heap. Smoothing
+uses straight lines that cost no more than the cells.
 """
 
 import math
@@ -29,40 +29,40 @@ from gigabrain_zenoh.navigation.block_bounds import (
 )
 from gigabrain_zenoh.navigation.costmap import LETHAL, NO_LANES, Costs, WayBits
 
-HALF_LENGTHS = (0.5, DIAGONAL / 2) * 4  # half its length
-MAX_BEND = 2  # ways to either side of that by which a cell was reached: behind, nothing is cheaper
+HALF_LENGTHS = (0.5, DIAGONAL / 2) * 4  # of a step, by way
+MAX_BEND = 2  # ways to either side of the last step; sharper bends are never cheaper
 BUCKETS_PER_COST = 24.0  # buckets for a cost of 1
-BUCKETS = 8192  # in a ring: they hold more than any one step can add
-SUM_TOLERANCE = 1e-10  # sums of the same numbers in another order differ by less
+BUCKETS = 8192  # in a ring that is longer than the most expensive step
+SUM_TOLERANCE = 1e-10  # above the rounding errors of sums in another order
 SPARE_ENTRIES = 1024
-ROOT_MARK = 8  # the way came from nowhere: it began here
-SETTLED_MARK = 16  # and more: the cell was settled
-RUN_STRIDE = 32  # and more: of this search
-LAST_RUN = np.iinfo(np.int32).max // RUN_STRIDE - 1  # the marks hold no greater one
-OUT_OF_ENTRIES = -1  # no room for more entries
+ROOT_MARK = 8  # mark of the start; other cells have the way of their last step, 0 to 7
+SETTLED_MARK = 16  # added for settled cells
+RUN_STRIDE = 32  # times the number of the search, added for all cells of that search
+LAST_RUN = np.iinfo(np.int32).max // RUN_STRIDE - 1  # largest number of a search in a mark
+OUT_OF_ENTRIES = -1  # result of a search that needs more entries
 NO_TARGET = (NOWHERE, NOWHERE)
 Direction = Literal["from", "to"]
 
-CORNER = 1e-6  # cells of a line within a cell: so little only touches its corner
-SAME_WAY = 1e-6  # of 45 degrees: a direction so near to one of the eight ways is that way
-STRAIGHT_TOLERANCE = 1 + 1e-9  # of two ways that cost the same the straight one
+CORNER = 1e-6  # [cells], a line with less than this inside a cell only touches its corner
+SAME_WAY = 1e-6  # tolerance of a direction, in steps of 45 degrees
+STRAIGHT_TOLERANCE = 1 + 1e-9  # so that straight lines win at equal cost
 
 
 class SearchMemory(NamedTuple):
     """Buffers of a search."""
 
-    g: Floats  # by cell, what the way to it costs
-    mark: Ints  # by cell, by what way it was reached, and in what turn
+    g: Floats  # by cell, the cost from the start
+    mark: Ints  # by cell, see ROOT_MARK
     first: Ints  # by bucket, the entry on top
-    entries: Ints  # row, column, and the entry below
+    entries: Ints  # (3, n): row, column, and the entry below
 
 
 class GridSearch:
-    """Searches with the same memory again and again. Not for two threads at once."""
+    """Searches with the same buffers each time. It is not thread-safe."""
 
     def __init__(self) -> None:
         self._shape = (0, 0)
-        self._turn = 0
+        self._run_number = 0
         none, first = np.empty(0, np.int32), np.empty(BUCKETS, np.int32)
         self._memory = SearchMemory(np.empty(0), none, first, np.empty((3, 0), np.int32))
         self._bound = block_bounds(self._shape)
@@ -72,11 +72,11 @@ class GridSearch:
     ) -> Ints | None:
         """Return the cheapest path from cell to cell (row, column), (n, 2); None without one.
 
-        Here and below, `against` holds the ways that lanes forbid, if there are any.
+        Here and below, `against` holds the ways that lanes forbid.
         """
         target = goal[0] * cost.shape[1] + goal[1]
         self._run(cost, start, goal, against, reverse=False)
-        if self._memory.mark[target] < RUN_STRIDE * self._turn + SETTLED_MARK:
+        if self._memory.mark[target] < RUN_STRIDE * self._run_number + SETTLED_MARK:
             return None
         cells = _trace(self._memory.mark, cost.shape[1], target)
         return np.column_stack(np.divmod(cells, np.int32(cost.shape[1])))
@@ -84,18 +84,20 @@ class GridSearch:
     def field(self, cost: Costs, cell: Cell, way: Direction, against: WayBits = NO_LANES) -> Floats:
         """Return the cost of the cheapest paths "to" `cell` or "from" it; inf without one.
 
-        The shape is (height, width), the unit cells: times the resolution, metres at cost 1.
+        The shape is (height, width). Times the resolution, a cost is in metres at cost 1.
         """
         self._run(cost, cell, NO_TARGET, against, reverse=way == "to")
         field = np.where(
-            self._memory.mark >= RUN_STRIDE * self._turn + SETTLED_MARK, self._memory.g, np.inf
+            self._memory.mark >= RUN_STRIDE * self._run_number + SETTLED_MARK,
+            self._memory.g,
+            np.inf,
         )
         return field.reshape(cost.shape)
 
     def costs_at_least(self, least: float, cost: Costs, start: Cell, goal: Cell) -> bool:
-        """Return whether it is sure, without a search over cells, that a path costs `least`."""
+        """Return whether bounds show that a path costs `least` or more, without a search."""
         if cost.shape != self._shape:
-            self._make_room(cost.shape)
+            self._allocate(cost.shape)
         cost = np.ascontiguousarray(cost)
         if self._bound.goal == goal and bound_after_changes(self._bound, cost, start) >= least:
             return True
@@ -103,15 +105,15 @@ class GridSearch:
         return bound_at(self._bound, cost, *start) >= least
 
     def reach(self, cost: Costs, start: Cell, against: WayBits = NO_LANES) -> None:
-        """Go wherever a way leads from `start`, for `nearest` to be asked."""
+        """Search all cells that are reachable from `start`, for a following call of `nearest`."""
         self._run(cost, start, NO_TARGET, against, reverse=False)
 
     def nearest(self, cost: Costs, row: float, column: float) -> Cell | None:
-        """Return the nearest cell that the last search reached and where the body fits."""
+        """Return the nearest cell that the last search reached, and in which the body fits."""
         found = _nearest(
             cost,
             self._memory.mark,
-            RUN_STRIDE * self._turn + SETTLED_MARK,
+            RUN_STRIDE * self._run_number + SETTLED_MARK,
             self._memory.g,
             row,
             column,
@@ -122,25 +124,27 @@ class GridSearch:
         self, cost: Costs, start: Cell, target: Cell, against: WayBits, *, reverse: bool
     ) -> None:
         if cost.shape != self._shape:
-            self._make_room(cost.shape)
+            self._allocate(cost.shape)
         cost = np.ascontiguousarray(cost)
         if target != NO_TARGET:
             self._bound = towards(target, start, cost, self._bound)
         while True:
-            if self._turn >= LAST_RUN:
-                self._memory.mark[:] = self._turn = 0
-            self._turn += 1
-            turn = RUN_STRIDE * self._turn
-            found = _search(cost, against, start, target, reverse, turn, self._memory, self._bound)
+            if self._run_number >= LAST_RUN:
+                self._memory.mark[:] = self._run_number = 0
+            self._run_number += 1
+            run_mark = RUN_STRIDE * self._run_number
+            found = _search(
+                cost, against, start, target, reverse, run_mark, self._memory, self._bound
+            )
             if found != OUT_OF_ENTRIES:
                 return
             more = np.empty((3, 2 * self._memory.entries.shape[1]), np.int32)
             self._memory = self._memory._replace(entries=more)
 
-    def _make_room(self, shape: tuple[int, ...]) -> None:
-        """Memory for a grid. What no search comes to is never touched, and costs nothing."""
+    def _allocate(self, shape: tuple[int, ...]) -> None:
+        """Allocate buffers for a grid. Pages that no search reaches take no memory."""
         size = shape[0] * shape[1]
-        self._shape, self._turn = (shape[0], shape[1]), 0
+        self._shape, self._run_number = (shape[0], shape[1]), 0
         self._bound = block_bounds(shape)
         entries = np.empty((3, size + SPARE_ENTRIES), np.int32)
         self._memory = SearchMemory(
@@ -150,17 +154,17 @@ class GridSearch:
 
 @kernel
 def _search(
-    cost: Costs, against: WayBits, start: Cell, target: Cell, reverse: bool, turn: int,
+    cost: Costs, against: WayBits, start: Cell, target: Cell, reverse: bool, run_mark: int,
     held: SearchMemory, bound: BlockBounds,
 ) -> int:  # fmt: skip
-    """Settle cells until no way to `target` is cheaper; return how many, or OUT_OF_ENTRIES."""
+    """Settle cells until no path to `target` is cheaper; return their number or OUT_OF_ENTRIES."""
     (height, width), flat, (g, mark, first, entries) = cost.shape, cost.ravel(), held
     lanes = against.ravel()
     first[:] = NOWHERE
-    at, best = start[0] * width + start[1], np.inf  # what the way to `target` costs, so far
-    g[at], mark[at] = 0.0, turn + ROOT_MARK
+    at, best = start[0] * width + start[1], np.inf  # cost of the best path to `target` so far
+    g[at], mark[at] = 0.0, run_mark + ROOT_MARK
     now = int(_bound(bound, cost, start[0], start[1], target) * BUCKETS_PER_COST)
-    _put(first, entries, int(NONE), now, 0.0, start[0], start[1])
+    _push(first, entries, int(NONE), now, 0.0, start[0], start[1])
     free, used, count, settled = NOWHERE, 1, 1, 0
     while count:
         top = first[now % BUCKETS]
@@ -169,9 +173,9 @@ def _search(
             continue
         row, column, first[now % BUCKETS] = entries[0, top], entries[1, top], entries[2, top]
         entries[2, top], free, count, cell = free, top, count - 1, row * width + column
-        base, here, way = g[cell], flat[cell], mark[cell] - turn
+        base, here, way = g[cell], flat[cell], mark[cell] - run_mark
         if way >= SETTLED_MARK:
-            continue  # a duplicate: it was reached at less meanwhile
+            continue  # a duplicate: a cheaper entry came first
         least = base + _bound(bound, cost, row, column, target)
         if least >= best - SUM_TOLERANCE and (row, column) != target:
             continue
@@ -184,12 +188,12 @@ def _search(
                 continue
             other = down * width + right
             found = base + HALF_LENGTHS[to] * here + HALF_LENGTHS[to] * flat[other]
-            if mark[other] >= turn and found >= g[other] - SUM_TOLERANCE:
+            if mark[other] >= run_mark and found >= g[other] - SUM_TOLERANCE:
                 continue
             aside, above = row * width + right, down * width + column
             if not _may_step(flat, lanes, cell, other, aside, above, to, reverse):
                 continue
-            g[other], mark[other] = found, turn + to
+            g[other], mark[other] = found, run_mark + to
             least = found + _bound(bound, cost, down, right, target)
             if (down, right) == target:
                 best = found
@@ -201,16 +205,16 @@ def _search(
                 entry, used = used, used + 1
             else:
                 return OUT_OF_ENTRIES
-            _put(first, entries, entry, now, least, down, right)
+            _push(first, entries, entry, now, least, down, right)
             count += 1
     return settled
 
 
 @lean_kernel
-def _put(
+def _push(
     first: Ints, entries: Ints, entry: int, now: int, least: float, row: int, column: int
 ) -> None:
-    """Put `entry`, for a cell, on top of the bucket of its `least` cost: from `now` on."""
+    """Put `entry`, for a cell, on top of the bucket of its `least` cost, or bucket `now`."""
     bucket = max(now, min(int(least * BUCKETS_PER_COST), now + BUCKETS - 1))
     entries[0, entry], entries[1, entry] = row, column
     entries[2, entry], first[bucket % BUCKETS] = first[bucket % BUCKETS], entry
@@ -221,7 +225,7 @@ def _may_step(
     flat: Costs, lanes: WayBits, cell: int, other: int, aside: int, above: int, to: int,
     reverse: bool,
 ) -> bool:  # fmt: skip
-    """Return whether a step may be taken; a diagonal one needs both cells beside it free."""
+    """Return whether a step is allowed; a diagonal one needs both cells beside it free."""
     ahead = to + 4 & 7 if reverse else to
     if lanes.size and (lanes[cell] | lanes[other]) >> ahead & 1:
         return False
@@ -266,12 +270,14 @@ def _trace(mark: Ints, width: int, target: int) -> Ints:
 
 
 @kernel
-def _nearest(cost: Costs, mark: Ints, done: int, g: Floats, row: float, column: float) -> int:
-    """Return the nearest settled cell; of equals the one that is cheaper to reach."""
+def _nearest(
+    cost: Costs, mark: Ints, settled_mark: int, g: Floats, row: float, column: float
+) -> int:
+    """Return the nearest settled cell; of several, the one cheapest to reach."""
     best, least, flat = NOWHERE, np.inf, cost.ravel()
     width = cost.shape[1]
     for cell in range(flat.size):
-        if mark[cell] >= done and flat[cell] < LETHAL:
+        if mark[cell] >= settled_mark and flat[cell] < LETHAL:
             away = (cell // width - row) ** 2 + (cell % width - column) ** 2
             if away < least or (away == least and g[cell] < g[best]):
                 best, least = cell, away
@@ -284,7 +290,7 @@ def line_cost(
 ) -> tuple[float, float]:
     """Return the cost of a straight line and the highest cost on it.
 
-    Both are inf outside the map; the latter is where the line goes against a lane.
+    Both are inf outside the map. The highest cost is inf for a line against a lane.
     """
     height, width = cost.shape
     length = math.hypot(to_x - x, to_y - y)
@@ -320,7 +326,7 @@ def line_cost(
 
 @kernel
 def _ways_of(right: float, down: float) -> int:
-    """Return the bits of the one or two ways that a straight line is made of; 0 without length."""
+    """Return the bits of the one or two ways nearest to a straight line; 0 without length."""
     if right == 0.0 and down == 0.0:
         return 0
     way = math.atan2(-down, right) * (4 / math.pi) + 8.0
@@ -330,7 +336,7 @@ def _ways_of(right: float, down: float) -> int:
 
 @kernel
 def smooth_path(cost: Costs, points: Floats, against: WayBits) -> Floats:
-    """Return those of `points` (n, 2) between which the path may go straight."""
+    """Return the `points` (n, 2) that remain when straight lines replace the others."""
     count = len(points)
     spent = np.zeros(count)
     for i in range(1, count):
@@ -347,7 +353,7 @@ def smooth_path(cost: Costs, points: Floats, against: WayBits) -> Floats:
 
 @kernel
 def _farthest(cost: Costs, points: Floats, spent: Floats, at: int, against: WayBits) -> int:
-    """Return the farthest point found that a straight line leads to: doubled steps, then halved."""
+    """Return the farthest point found on a straight line, by doubling, then halving the hop."""
     last = len(points) - 1
     good, bad, hop = at + 1, last + 1, 2
     while good < last:
@@ -376,7 +382,7 @@ def _is_straight(
 
 @kernel
 def costs_to_go(cost: Costs, points: Floats, against: WayBits) -> Floats:
-    """Return the cost left to the end of a path from each of its `points` (n, 2), as (n,)."""
+    """Return the costs (n,) from each of the `points` (n, 2) of a path to its end."""
     left = np.zeros(len(points))
     for i in range(len(points) - 2, -1, -1):
         x, y, to_x, to_y = points[i, 0], points[i, 1], points[i + 1, 0], points[i + 1, 1]
@@ -386,7 +392,7 @@ def costs_to_go(cost: Costs, points: Floats, against: WayBits) -> Floats:
 
 @kernel
 def is_free(cost: Costs, points: Floats, against: WayBits) -> bool:
-    """Return whether a body may go along `points` (n, 2). It may leave a tight spot first."""
+    """Return whether a path along `points` (n, 2) is free, except for leaving a tight spot."""
     x, y = points[0, 0], points[0, 1]
     if line_cost(cost, x, y, x, y, against)[1] == np.inf:
         return False

@@ -1,8 +1,8 @@
 """Hybrid A*: paths of a car from pose to pose, with its turning radius and in reverse.
 
 Dolgov, Thrun, Montemerlo and Diebel, Practical search techniques in path planning for autonomous
-driving, 2008. Nodes are poses, one for each bin of place and heading; they are left by arcs of
-constant curvature, and by a Reeds-Shepp path to the goal where that is free.
+driving, 2008. Nodes are poses, one for each bin of position and heading. Their successors are the
+ends of arcs of constant curvature, and the goal if a Reeds-Shepp path to it is free.
 """
 
 import math
@@ -16,72 +16,72 @@ from gigabrain_zenoh.kernels.jit import kernel, lean_kernel
 from gigabrain_zenoh.navigation.costmap import Costs
 from gigabrain_zenoh.navigation.reeds_shepp import SEGMENTS, TINY, along, best_word
 
-BIN_M, HEADINGS = 0.1, 72  # bins of place [m] and heading
-STEP_M = 0.2  # [m], of an arc: it leaves its bin of place
-SAMPLE_M = 0.05  # [m], between poses that are looked at, and in the result
-BENDS = (-1.0, -0.5, 0.0, 0.5, 1.0)  # of an arc, in units of the tightest
-REVERSE_COST = 1.5  # of a metre, where one forwards costs 1
-SWITCH_COST = 0.4  # [m], of a change of direction
-BEND_COST = 0.05  # [m], of changing from straight to the tightest turn
-EXPAND_M = 1.0  # from the goal a Reeds-Shepp path is tried at every node; farther off more seldom
-PATIENCE = 3000  # nodes after a way to the goal is known, until it is taken
+BIN_M, HEADINGS = 0.1, 72  # size of the bins of position, number of those of heading
+STEP_M = 0.2  # length of an arc, so that it leaves its bin
+SAMPLE_M = 0.05  # between poses that are checked, and in the result
+BENDS = (-1.0, -0.5, 0.0, 0.5, 1.0)  # curvatures of arcs, relative to the largest
+REVERSE_COST = 1.5  # of a metre in reverse, relative to one forwards
+SWITCH_COST = 0.4  # [m], of a change between forwards and reverse
+BEND_COST = 0.05  # [m], of a change from straight to the largest curvature
+SHOT_EVERY_M = 1.0  # at n times this cost to the goal, each n-th node tries a Reeds-Shepp path
+PATIENCE = 3000  # nodes that are expanded after the first path is found
 MAX_NODES = 1 << 17
-TABLE = 1 << 19  # of nodes, by their bin
-SHOT = len(BENDS) * 2  # the move of a node that a Reeds-Shepp path led to
+TABLE_SIZE = 1 << 19  # slots of the hash table from bins to nodes
+SHOT = len(BENDS) * 2  # move of a node that is reached by a Reeds-Shepp path
 ROOT = -1
-GOAL_HEADINGS = 16  # tried, where any heading will do
-LEAVE_M = 0.5  # [m] round start and goal, where less room than usual may have to do
+GOAL_HEADINGS = 16  # tried for a goal of any heading
+LEAVE_M = 0.5  # radius round start and goal in which less room than usual is allowed
 Ints = NDArray[np.int64]
 Singles = NDArray[np.float32]
 Pose = tuple[float, float, float]  # x, y [m], yaw [rad]
 
 
 class Car(NamedTuple):
-    """The shape of a car: discs along its middle line that cover it, and its tightest turn."""
+    """The shape of a car as discs along its middle line, and its turning radius."""
 
-    radius: float  # [m], of the tightest turn
-    first: float  # [m], from the origin to the middle of the first disc
-    spacing: float  # [m], between them
-    discs: int
-    room: float  # [m], from their middles to an obstacle
-    middle: float  # [m], from the origin to the body's middle
+    radius: float  # [m], turning radius
+    first: float  # [m], x of the middle of the first disc
+    spacing: float  # [m], between discs
+    discs: int  # number of discs
+    room: float  # [m], radius of the discs
+    middle: float  # [m], x of the body's middle
 
 
 class Terrain(NamedTuple):
     """A map for a car: clearance, cost and distance to the goal of each cell."""
 
     distance: Singles  # (h, w) [m], to the nearest obstacle
-    cost: Costs  # (h, w), of a metre
-    to_go: Floats  # (h, w) [m at cost 1], from each cell to the goal; inf where none leads there
+    cost: Costs  # (h, w), per metre
+    to_go: Floats  # (h, w) [m at cost 1], cost to the goal; inf where no path leads to it
     resolution: float  # [m]
     origin_x: float  # [m]
     origin_y: float
 
 
 class Nodes(NamedTuple):
-    """Memory of a search."""
+    """Buffers of a search."""
 
-    pose: Floats  # (n, 3)
-    g: Floats  # (n,), cost so far [m]
+    pose: Floats  # (n, 3): x, y [m], yaw [rad]
+    g: Floats  # (n,), cost from the start [m]
     link: Ints  # (n, 3): parent, move, and whether it is closed
-    table: Ints  # (TABLE, 2): bin, node
+    table: Ints  # (TABLE_SIZE, 2): bin, node
     heap: Floats  # (2 n, 2): f, node
 
 
 def nodes() -> Nodes:
-    """Return the memory of a search."""
+    """Return the buffers of a search."""
     return Nodes(
         np.empty((MAX_NODES, 3)),
         np.empty(MAX_NODES),
         np.empty((MAX_NODES, 3), np.int64),
-        np.empty((TABLE, 2), np.int64),
+        np.empty((TABLE_SIZE, 2), np.int64),
         np.empty((4 * MAX_NODES, 2)),
     )
 
 
 @lean_kernel
 def _cell(terrain: Terrain, x: float, y: float) -> tuple[int, int, bool]:
-    """Return row and column at (x, y), and whether they are inside."""
+    """Return row and column at (x, y), and whether they are in the map."""
     row = math.floor((y - terrain.origin_y) / terrain.resolution)
     column = math.floor((x - terrain.origin_x) / terrain.resolution)
     rows, columns = terrain.distance.shape
@@ -91,9 +91,9 @@ def _cell(terrain: Terrain, x: float, y: float) -> tuple[int, int, bool]:
 
 @lean_kernel
 def room_at(terrain: Terrain, car: Car, x: float, y: float, yaw: float) -> float:
-    """Return the distance [m] of the nearest of the car's discs' middles to an obstacle.
+    """Return the least distance of the middles of the car's discs to an obstacle [m].
 
-    It is -1 where one of them is outside the map.
+    It is -1 if one of them is outside the map.
     """
     cosine, sine, least = math.cos(yaw), math.sin(yaw), math.inf
     for n in range(car.discs):
@@ -119,7 +119,7 @@ def drive(
 ) -> tuple[float, float, float, float]:
     """Return the pose after an arc, and its cost; inf where the car does not fit.
 
-    `needs` (3, 3): the place of start and goal, and the room near them [m]; that elsewhere, last.
+    `needs` (3, 3) are x, y and the required room [m] of start and goal; last, the room elsewhere.
     """
     count = max(1, math.ceil(abs(length) / SAMPLE_M))
     step, cost = length / count, 0.0
@@ -147,10 +147,10 @@ def _bin(terrain: Terrain, x: float, y: float, yaw: float) -> int:
 
 @lean_kernel
 def _slot(table: Ints, key: int) -> int:
-    """Return the slot of a bin, or the free one where it would be."""
-    slot = (key * 2654435761) % TABLE
+    """Return the slot of a bin, or the free slot for it."""
+    slot = (key * 2654435761) % TABLE_SIZE
     while table[slot, 0] != key and table[slot, 0] != -1:
-        slot = (slot + 1) % TABLE
+        slot = (slot + 1) % TABLE_SIZE
     return slot
 
 
@@ -168,7 +168,7 @@ def _push(heap: Floats, size: int, f: float, node: int) -> None:
 
 @lean_kernel
 def _pop(heap: Floats, size: int) -> int:
-    """Take the best of `size` entries away, and return its node."""
+    """Remove the cheapest of `size` entries, and return its node."""
     top, last = int(heap[0, 1]), size - 1
     f, node, at = heap[last, 0], heap[last, 1], 0
     while True:
@@ -186,13 +186,13 @@ def _pop(heap: Floats, size: int) -> int:
 
 
 @kernel
-def _to_goal(
+def _try_shot(
     terrain: Terrain, car: Car, pose: Pose, goal: Pose, needs: Floats, lengths: Floats,
     turns: Floats,
 ) -> tuple[float, float]:  # fmt: skip
     """Fill in the Reeds-Shepp word to the goal; return its cost, and the heading at its end.
 
-    The cost is inf where the word is not free. With a goal of any heading, the cheapest is taken.
+    The cost is inf if the word is not free. For a goal of any heading, it is the cheapest word.
     """
     x, y, yaw = pose
     cosine, sine, any_yaw = math.cos(yaw), math.sin(yaw), math.isnan(goal[2])
@@ -222,7 +222,7 @@ def _to_goal(
 
 @lean_kernel
 def _estimate(terrain: Terrain, car: Car, pose: Pose, goal: Pose) -> float:
-    """Return the cost to the goal as if the car could turn on the spot."""
+    """Estimate the cost to the goal: the largest of those by cells, straight line and turn."""
     row, column, inside = _cell(terrain, pose[0], pose[1])
     straight = math.hypot(goal[0] - pose[0], goal[1] - pose[1])
     if not inside or terrain.to_go[row, column] == math.inf:
@@ -235,19 +235,19 @@ def _estimate(terrain: Terrain, car: Car, pose: Pose, goal: Pose) -> float:
 
 
 @kernel
-def _set(memory: Nodes, node: int, at: Pose, cost: float, parent: int, move: int) -> None:
-    """Set a node that is open: its pose, the cost of its way, and the last step of that."""
+def _set_node(memory: Nodes, node: int, at: Pose, cost: float, parent: int, move: int) -> None:
+    """Set an open node: its pose, its cost from the start, its parent and the move from that."""
     pose, g, link = memory[0], memory[1], memory[2]
     pose[node, 0], pose[node, 1], pose[node, 2] = at
     g[node], link[node, 0], link[node, 1], link[node, 2] = cost, parent, move, 0
 
 
 @kernel
-def _begin(terrain: Terrain, start: Pose, estimate: float, memory: Nodes) -> None:
-    """Forget all nodes, and open one at the start."""
+def _open_start(terrain: Terrain, start: Pose, estimate: float, memory: Nodes) -> None:
+    """Remove all nodes, and open one at the start."""
     table, heap = memory[3], memory[4]
     table[:, 0] = -1
-    _set(memory, 0, start, 0.0, ROOT, ROOT)
+    _set_node(memory, 0, start, 0.0, ROOT, ROOT)
     key = _bin(terrain, start[0], start[1], start[2])
     slot = _slot(table, key)
     table[slot, 0], table[slot, 1] = key, 0
@@ -255,8 +255,8 @@ def _begin(terrain: Terrain, start: Pose, estimate: float, memory: Nodes) -> Non
 
 
 @kernel
-def _with_change(cost: float, move: int, to: int) -> float:
-    """Return a step's cost with that of changing from `move` to `to`: direction and bend."""
+def _add_change_cost(cost: float, move: int, to: int) -> float:
+    """Return a step's cost plus that of changing direction and curvature, from `move` to `to`."""
     if (move >= len(BENDS)) != (to >= len(BENDS)):
         cost += SWITCH_COST
     return cost + BEND_COST * abs(BENDS[to % len(BENDS)] - BENDS[move % len(BENDS)])
@@ -264,7 +264,7 @@ def _with_change(cost: float, move: int, to: int) -> float:
 
 @kernel
 def _begins_in_reverse(lengths: Floats) -> bool:
-    """Return whether the first segment of some length is driven backwards."""
+    """Return whether the first segment that is not empty is driven in reverse."""
     for length in lengths:
         if abs(length) > TINY:
             return bool(length < 0.0)
@@ -275,10 +275,10 @@ def _begins_in_reverse(lengths: Floats) -> bool:
 def search(
     terrain: Terrain, car: Car, start: Pose, goal: Pose, needs: Floats, memory: Nodes
 ) -> int:
-    """Return the node at the goal, with links back to the start; ROOT if no way leads there."""
+    """Return the node at the goal, linked back to the start; ROOT if no path is found."""
     pose, g, link, table, heap = memory
     lengths, turns = np.empty(SEGMENTS), np.empty(SEGMENTS)
-    _begin(terrain, start, _estimate(terrain, car, start, goal), memory)
+    _open_start(terrain, start, _estimate(terrain, car, start, goal), memory)
     count, size, found, patience = 1, 1, ROOT, PATIENCE
     while size > 0 and count < MAX_NODES - 2 * len(BENDS) - 1 and size < len(heap) - 32:
         node = _pop(heap, size)
@@ -292,13 +292,13 @@ def search(
             return found
         here = (pose[node, 0], pose[node, 1], pose[node, 2])
         move = link[node, 1]
-        if node % max(1, int(_estimate(terrain, car, here, goal) / EXPAND_M)) == 0:
-            shot, to_yaw = _to_goal(terrain, car, here, goal, needs, lengths, turns)
+        if node % max(1, int(_estimate(terrain, car, here, goal) / SHOT_EVERY_M)) == 0:
+            shot, to_yaw = _try_shot(terrain, car, here, goal, needs, lengths, turns)
             total = g[node] + shot
             if move >= 0 and _begins_in_reverse(lengths) != (move >= len(BENDS)):
                 total += SWITCH_COST
             if total < math.inf and (found == ROOT or total < g[found]):
-                _set(memory, count, (goal[0], goal[1], to_yaw), total, node, SHOT)
+                _set_node(memory, count, (goal[0], goal[1], to_yaw), total, node, SHOT)
                 _push(heap, size, total, count)
                 found, count, size = count, count + 1, size + 1
         for to in range(2 * len(BENDS)):
@@ -307,13 +307,13 @@ def search(
             if cost == math.inf:
                 continue
             if move >= 0:
-                cost = _with_change(cost, move, to)
+                cost = _add_change_cost(cost, move, to)
             key = _bin(terrain, x, y, yaw)
             slot = _slot(table, key)
             other, total, known = table[slot, 1], g[node] + cost, table[slot, 0] == key
             if known and (link[other, 2] or g[other] <= total):
                 continue
-            _set(memory, count, (x, y, yaw), total, node, to)
+            _set_node(memory, count, (x, y, yaw), total, node, to)
             if known:
                 link[other, 2] = 1  # this one is cheaper
             table[slot, 0], table[slot, 1] = key, count

@@ -1,4 +1,4 @@
-"""Reeds-Shepp paths: the shortest ways of a car from pose to pose in the open, with reversing.
+"""Reeds-Shepp paths: the shortest paths of a car between poses in free space, with reversing.
 
 Reeds and Shepp, Optimal paths for a car that goes both forwards and backwards, Pacific Journal of
 Mathematics 145 (1990). A word is up to five arcs and straight lines. Its lengths are in units of
@@ -15,7 +15,7 @@ from gigabrain_zenoh.kernels.jit import kernel, lean_kernel
 TINY = 1e-9
 QUARTER = 0.5 * math.pi
 SEGMENTS = 5
-# of each family of words the turns of its segments (1: left), and their lengths by t, u and v
+# for each family of words, the turns of its segments (1: left), and their lengths by t, u and v
 TURNS = np.array([
     (1, 0, 1, 0, 0), (1, 0, -1, 0, 0), (1, -1, 1, 0, 0), (1, -1, 1, 0, 0),
     (1, -1, 1, -1, 0), (1, -1, 1, -1, 0), (1, -1, 0, 1, 0), (1, -1, 0, -1, 0),
@@ -40,8 +40,8 @@ def best_word(
 ) -> float:
     """Fill in the cheapest word to a pose, seen from the start, and return its cost.
 
-    `x` and `y` are in units of the turning radius. The `prices` are of a unit in reverse, where
-    one forwards costs 1, and of a change of direction. `lengths` and `turns` are (SEGMENTS,).
+    `x` and `y` are in units of the turning radius. The `prices` are those of a unit in reverse,
+    relative to one forwards, and of a change of direction. `lengths` and `turns` are (SEGMENTS,).
     """
     best, cosine, sine = math.inf, math.cos(yaw), math.sin(yaw)
     word = np.empty(SEGMENTS)
@@ -84,8 +84,8 @@ def best_word(
 def _solve(family: int, x: float, y: float, yaw: float) -> Solution:
     """Return whether a family has a word to a pose, and its t, u and v."""
     sine, cosine = math.sin(yaw), math.cos(yaw)
-    same_x, same_y = x - sine, y - 1.0 + cosine  # it ends with a turn to the left,
-    other_x, other_y = x + sine, y - 1.0 - cosine  # or to the right
+    same_x, same_y = x - sine, y - 1.0 + cosine  # for words that end with a left turn,
+    other_x, other_y = x + sine, y - 1.0 - cosine  # or a right turn
     if family == 0:
         return _left_straight_left(same_x, same_y, yaw)
     if family == 1:
@@ -139,7 +139,7 @@ def _left_right_left(x: float, y: float, yaw: float) -> Solution:
 
 @lean_kernel
 def _outer_turns(u: float, v: float, x: float, y: float, yaw: float) -> tuple[float, float]:
-    """Return the first and the last turn around two in the middle, `u` and `v`."""
+    """Return the first and the last turn of a word, from the two middle turns `u` and `v`."""
     delta = _wrapped(u - v)
     a, b = math.sin(u) - math.sin(delta), math.cos(u) - math.cos(delta) - 1.0
     first = math.atan2(y * a - x * b, x * a + y * b)

@@ -1,7 +1,6 @@
 """Zones of a map for the planners: cells to keep out of, lanes, and speed limits.
 
-A zone map is made once for each change of the zones, and its overlay once for each shape of the
-grid: neither once for each plan.
+A zone map is made when the zones change, and its overlay when the shape of the grid changes.
 """
 
 import itertools
@@ -28,32 +27,32 @@ from gigabrain_zenoh.navigation.costmap import (
     clearance_costs,
 )
 
-EDGE_STEP = 0.5  # cells between the points of an edge, whose cells are filled too
-AGAINST_COSINE = -0.2  # of the angle between a way and a lane, from where on it goes against it
-MAX_NAMED = 3  # lanes, in a text
-MIN_USE_M = 0.5  # [m] along a lane, from where on a path uses it
-OCCUPIED = 100  # of a cell to keep out of
+EDGE_STEP = 0.5  # [cells] between points of an edge, whose cells are filled too
+AGAINST_COSINE = -0.2  # of the angle to a lane; ways with a smaller one are against it
+MAX_NAMED = 3  # lanes in a text
+MIN_USE_M = 0.5  # a path uses a lane that it follows for more than this
+OCCUPIED = 100  # value of cells in keep-out zones
 
 REACTION_S = 0.3  # before the body slows down for a speed zone
-BRAKING_SHARE = 0.5  # of its deceleration, with which it slows down
-MIN_LOOK_M = 1.0  # [m] of the path that are looked at for speed zones
+BRAKING_SHARE = 0.5  # of the body's deceleration, used to slow down
+MIN_LOOK_M = 1.0  # of the path, examined for speed zones
 
 Mask = NDArray[np.uint8]
-Box = tuple[float, float, float, float]  # least x and y [m], greatest x and y
+Box = tuple[float, float, float, float]  # least x and y, greatest x and y [m]
 
 
 class LanePart(NamedTuple):
     """A straight part of a one-way lane."""
 
     corners: Floats  # (4, 2) [m]
-    begin: Floats  # (2,) [m], the middle of its first edge
-    ahead: Floats  # (2,), its direction, of length 1
+    begin: Floats  # (2,) [m], middle of the first edge
+    ahead: Floats  # (2,), unit vector of the direction
     length: float  # [m]
     half_width: float  # [m]
-    against: int  # bits of the ways that it forbids
+    against: int  # bits of forbidden ways
 
     def leads_along(self, path: Floats) -> bool:
-        """Return whether a path (n, 2) [m] makes way along the direction of this part."""
+        """Return whether a `path` (n, 2) [m] follows this part in its direction."""
         x, y = self.ahead
         off = path - self.begin
         along, aside = off @ self.ahead, np.abs(off @ np.array((-y, x)))
@@ -64,7 +63,7 @@ class LanePart(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Area:
-    """A zone with its polygon, or the middle of its lane."""
+    """A zone with its polygon, or the middle line of its lane."""
 
     zone: Zone
     corners: Floats  # (n, 2) [m]
@@ -72,7 +71,7 @@ class Area:
     parts: tuple[LanePart, ...] = ()  # of a lane
 
     def near(self, x: float, y: float, reach: float) -> bool:
-        """Return whether its box is within `reach` [m] of a place."""
+        """Return whether the box of the zone is within `reach` [m] of (x, y)."""
         left, bottom, right, top = self.box
         return left - reach <= x <= right + reach and bottom - reach <= y <= top + reach
 
@@ -82,11 +81,11 @@ class SpeedCap:
     """The speed that a zone allows now."""
 
     speed: float  # [m/s]
-    zone: str  # its name
+    zone: str  # name of the zone
 
 
 class ZoneMap:
-    """The zones of one map, ready for planning. It does not change."""
+    """The zones of one map, prepared for planning. It is immutable."""
 
     def __init__(self, zones: Iterable[Zone]) -> None:
         areas = [_area(zone) for zone in zones]
@@ -100,7 +99,7 @@ class ZoneMap:
         return not self.keepouts and not self.lanes
 
     def overlay(self, grid: OccupancyGrid, rules: Inflation) -> ZoneOverlay | None:
-        """Return the zones on the cells of `grid`; None without keep-out zones and lanes."""
+        """Return the zones in cells of `grid`; None without keep-out zones and lanes."""
         if self.empty:
             return None
         cost = cells = None
@@ -117,7 +116,7 @@ class ZoneMap:
     def problem(self, x: float, y: float, fits: float) -> str:
         """Return why the body must not be at (x, y) [m], or an empty text.
 
-        It needs `fits` [m] from its centre.
+        Its centre needs a distance of `fits` [m].
         """
         place = np.array(((x, y),))
         for area in self.keepouts:
@@ -132,7 +131,7 @@ class ZoneMap:
         return ""
 
     def in_the_way(self, path: Floats) -> str:
-        """Return which zone a `path` (n, 2) [m] does not respect, as text."""
+        """Return which zones a `path` (n, 2) [m] would violate, as text."""
         for area in self.keepouts:
             if polygon.contains(area.corners, path).any():
                 return f"without entering keep-out zone {area.zone.name!r}"
@@ -141,14 +140,14 @@ class ZoneMap:
         return f"that keeps clear of the keep-out zones{lanes}"
 
     def keepouts_near(self, x: float, y: float, reach: float) -> tuple[Floats, ...]:
-        """Return the polygons to keep out of within `reach` [m] of a place, (n, 2) [m] each."""
+        """Return the polygons (n, 2) [m] of keep-out zones within `reach` [m] of (x, y)."""
         return tuple(area.corners for area in self.keepouts if area.near(x, y, reach))
 
     def lanes_beside(self, x: float, y: float, reach: float, path: Floats) -> tuple[Floats, ...]:
-        """Return the parts of lanes near a place along which a `path` (n, 2) [m] does not lead.
+        """Return the parts of nearby lanes that a `path` (n, 2) [m] does not follow.
 
-        A path leads past a lane that it must not go against, or out of it, or across. The local
-        planner knows no directions, and would take the shorter way through it.
+        The path may lead past a lane, out of it, or across it. The local planner knows no
+        directions, and might take a shorter way against the lane.
         """
         found: list[Floats] = []
         if not self.lanes:
@@ -164,10 +163,10 @@ class ZoneMap:
     def speed_cap(
         self, here: Pose, footprint: Corners, path: Floats, speed: float, deceleration: float
     ) -> SpeedCap | None:
-        """Return the lowest speed that a zone allows, there or on the way to it; None without one.
+        """Return the lowest speed that a zone ahead or around allows; None without one.
 
-        The body drives with `speed` [m/s] along `path` (n, 2) [m], which begins where it is. A zone
-        counts where the body could touch it when it turns.
+        The body drives at `speed` [m/s] along `path` (n, 2) [m], from where it is. A zone counts
+        where the turning body could touch it.
         """
         if not self.speeds:
             return None
@@ -197,7 +196,7 @@ class ZoneMap:
         return cells.view(np.int8)
 
     def _against(self, grid: OccupancyGrid) -> WayBits:
-        """Return the ways that lanes forbid; where a lane bends, those that both parts forbid."""
+        """Return the ways that lanes forbid. Overlapping parts of a lane forbid common ways."""
         found = np.zeros((grid.height, grid.width), np.uint8)
         for area in self.lanes:
             outlines = [_in_cells(grid, part.corners) for part in area.parts]
@@ -245,7 +244,7 @@ def _in_cells(grid: OccupancyGrid, corners: Floats) -> Floats:
 
 
 def fill(cells: Mask, corners: Floats, value: int) -> None:
-    """Fill a polygon, (n, 2) in cells, in `cells` (height, width), with those that it touches."""
+    """Set the `cells` (height, width) that a polygon (n, 2), in cells, covers or touches."""
     height, width = cells.shape
     inside = clipped(corners, (-1.0, -1.0, width + 1.0, height + 1.0))
     if not len(inside):
@@ -258,7 +257,7 @@ def fill(cells: Mask, corners: Floats, value: int) -> None:
 
 
 def _covered(corners: Floats, shape: tuple[int, ...]) -> NDArray[np.bool_]:
-    """Return the cells (height, width) whose middle is in a polygon, or that an edge crosses."""
+    """Return the cells (height, width) whose middle is inside a polygon or that an edge crosses."""
     height, width = shape
     ends = np.roll(corners, -1, axis=0)
     crossings = np.zeros((height, width + 1), np.uint8)  # before a cell's middle, modulo 256
@@ -282,7 +281,7 @@ def _covered(corners: Floats, shape: tuple[int, ...]) -> NDArray[np.bool_]:
 
 
 def clipped(corners: Floats, box: Box) -> Floats:
-    """Return the part of a polygon (n, 2) within `box` (m, 2).
+    """Return the part (m, 2) of a polygon (n, 2) inside `box`.
 
     Sutherland and Hodgman, Reentrant polygon clipping, CACM 1974.
     """
@@ -290,9 +289,9 @@ def clipped(corners: Floats, box: Box) -> Floats:
         if not len(corners):
             break
         ends = np.roll(corners, -1, axis=0)
-        room, then = sign * (corners[:, axis] - limit), sign * (ends[:, axis] - limit)
-        crosses = (room < 0) != (then < 0)
-        share = room / np.where(crosses, room - then, 1.0)
+        room, end_room = sign * (corners[:, axis] - limit), sign * (ends[:, axis] - limit)
+        crosses = (room < 0) != (end_room < 0)
+        share = room / np.where(crosses, room - end_room, 1.0)
         meets = corners + share[:, None] * (ends - corners)
         both = np.stack((corners, meets), axis=1).reshape(-1, 2)
         corners = both[np.stack((room >= 0, crosses), axis=1).ravel()]

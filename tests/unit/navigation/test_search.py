@@ -154,9 +154,9 @@ def test_a_grid_that_needs_more_room_than_thought_gets_it() -> None:
 def test_marks_of_months_of_searches_are_reset_in_time() -> None:
     search, cost = GridSearch(), np.ones((20, 30))
     expected = search.path(cost, (1, 1), (15, 22))
-    search._turn = np.iinfo(np.int32).max // 32 - 3  # 6.7e7 searches later
+    search._run_number = np.iinfo(np.int32).max // 32 - 3  # 6.7e7 searches later
     for _ in range(6):
         path = search.path(cost, (1, 1), (15, 22))
         assert path is not None
         assert np.array_equal(path, expected)
-    assert search._turn < 10
+    assert search._run_number < 10
