@@ -57,13 +57,13 @@ QUICK = LocalSettings(samples=300, window=5.0)
 
 
 def wall(begin: tuple[float, float], end: tuple[float, float]) -> Floats:
-    """Points every 2 cm."""
+    """Return points every 2 cm."""
     count = max(2, round(math.dist(begin, end) / 0.02))
     return np.linspace(begin, end, count)
 
 
 class Drive:
-    """One drive. `walls` (n, 2) are all seen at once; `someone` says where discs are, by time."""
+    """One drive. All of `walls` (n, 2) is visible; `someone` returns the discs at a time."""
 
     def __init__(
         self,
@@ -83,12 +83,12 @@ class Drive:
         self._queue = deque([Velocity()] * round(response.delay / TICK_S))
         self._sent: deque[SentCommand] = deque(maxlen=25)
         self.tick = 0
-        self.least = math.inf  # [m], from any wall or disc
+        self.least = math.inf  # [m], smallest clearance so far
         self.plans: list[LocalPlan] = []
         self.poses: list[Pose] = []
 
     def go(self, seconds: float) -> LocalPlan:
-        """Drive for so long, or until it has arrived."""
+        """Drive for `seconds`, or until the robot has arrived."""
         for _ in range(round(seconds / 0.1)):
             plan = self.planner.plan(self.request())
             self.plans.append(plan)
@@ -117,10 +117,10 @@ class Drive:
     def _tick(self, command: Velocity) -> None:
         self._sent.append(SentCommand(self.tick, command))
         self._queue.append(command)
-        told, lag = self._queue.popleft(), first_order_lag(self.response.lag, TICK_S)
-        vx, ahead = lagged_step(self.velocity.linear_x, told.linear_x, lag, TICK_S)
-        vy, aside = lagged_step(self.velocity.linear_y, told.linear_y, lag, TICK_S)
-        w, turned = lagged_step(self.velocity.angular_z, told.angular_z, lag, TICK_S)
+        active, lag = self._queue.popleft(), first_order_lag(self.response.lag, TICK_S)
+        vx, ahead = lagged_step(self.velocity.linear_x, active.linear_x, lag, TICK_S)
+        vy, aside = lagged_step(self.velocity.linear_y, active.linear_y, lag, TICK_S)
+        w, turned = lagged_step(self.velocity.angular_z, active.angular_z, lag, TICK_S)
         middle = self.pose.yaw + 0.5 * turned
         self.pose = Pose(
             x=self.pose.x + math.cos(middle) * ahead - math.sin(middle) * aside,

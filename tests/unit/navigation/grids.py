@@ -1,4 +1,4 @@
-"""Small maps, drawn: `#` an obstacle, `.` free, `?` unknown; the first line is the farthest."""
+"""Small maps as text: `#` obstacle, `.` free, `?` unknown; the first line is the last row."""
 
 import heapq
 import math
@@ -24,7 +24,7 @@ def grid_of(cells: np.ndarray, resolution: float = 0.1) -> OccupancyGrid:
 
 
 def drawn(picture: str, times: int = 1) -> np.ndarray:
-    """The cells of a picture, each `times` as large."""
+    """Return the cells of a picture, each repeated `times` in both directions."""
     rows = [[CELLS[sign] for sign in line] for line in picture.split()]
     return np.array(rows[::-1], np.int8).repeat(times, 0).repeat(times, 1)
 
@@ -34,7 +34,7 @@ def empty(metres_x: float, metres_y: float, resolution: float = 0.1) -> np.ndarr
 
 
 def cheapest(cost: np.ndarray, start: Cell) -> dict[Cell, float]:
-    """Dijkstra as in the book: what another hand makes of the same rules."""
+    """Return the cost to each reachable cell, by a plain Dijkstra with the same rules."""
     lethal, found, heap = 100.0, {start: 0.0}, [(0.0, start)]
     height, width = cost.shape
     while heap:

@@ -1,4 +1,4 @@
-"""A quick body among quick things; all others plan as if there were none of that."""
+"""A quick body among quick obstacles has its own plans; other bodies are not affected."""
 
 import math
 from dataclasses import replace
@@ -35,8 +35,8 @@ from gigabrain_zenoh.qa.bench.barn import drive_functions
 from gigabrain_zenoh.qa.bench.barn_course import HARD, JACKAL, BarnWorld, MovingDisc
 from tests.unit.navigation.drives import OMNI, WAFFLE, wall
 
-NOTHING = np.empty((0, 2))
-NOBODY = np.empty((0, 6))
+NO_POINTS = np.empty((0, 2))
+NO_DISCS = np.empty((0, 6))
 FEW = LocalSettings(samples=128, window=6.0)
 LOOKED = round(dynamic_obstacles.LOOK_AROUND_S / 0.02) + 1  # ticks
 
@@ -48,7 +48,7 @@ def plans(body: BodyDescription, speed: float, cycles: int = 3) -> list[LocalPla
         y = -1.0 + speed * 0.02 * tick
         away = math.hypot(1.5, y)
         hit = np.array([(1.5, y)]) * (1.0 - 0.3 / away)
-        somebody = Obstacle(id=1, x=1.5, y=y, velocity_y=speed, radius=0.3)
+        obstacle = Obstacle(id=1, x=1.5, y=y, velocity_y=speed, radius=0.3)
         made.append(
             planner.plan(
                 PlanRequest(
@@ -57,7 +57,7 @@ def plans(body: BodyDescription, speed: float, cycles: int = 3) -> list[LocalPla
                     velocity=Velocity(),
                     goal=Goal(x=2.5, y=0.0),
                     hits=hit,
-                    obstacles=(somebody,),
+                    obstacles=(obstacle,),
                 )
             )
         )
@@ -67,7 +67,7 @@ def plans(body: BodyDescription, speed: float, cycles: int = 3) -> list[LocalPla
 @pytest.mark.parametrize(
     ("body", "speed"), [(WAFFLE, 1.2), (OMNI, 1.2), (WAFFLE, 0.0), (JACKAL, 0.0), (JACKAL, 0.25)]
 )
-def test_slow_bodies_and_those_among_what_is_slow_plan_as_ever(
+def test_plans_are_unchanged_if_body_or_obstacles_are_slow(
     body: BodyDescription, speed: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     here = plans(body, speed)
@@ -75,7 +75,7 @@ def test_slow_bodies_and_those_among_what_is_slow_plan_as_ever(
     assert plans(body, speed) == here
 
 
-def test_a_quick_body_among_quick_things_looks_two_seconds_ahead(
+def test_a_quick_body_among_quick_obstacles_plans_two_seconds(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     here = plans(JACKAL, 1.2)
@@ -86,14 +86,14 @@ def test_a_quick_body_among_quick_things_looks_two_seconds_ahead(
     assert there != here
 
 
-def test_a_quick_body_looks_round_before_it_first_drives_off() -> None:
+def test_a_quick_body_looks_round_before_it_drives() -> None:
     planner = LocalPlanner(JACKAL, FEW)
     request = PlanRequest(
         tick=100,
         pose=Pose(x=0.0, y=0.0, yaw=0.0),
         velocity=Velocity(),
         goal=Goal(x=2.5, y=0.0),
-        hits=NOTHING,
+        hits=NO_POINTS,
     )
     first, last = planner.plan(request), planner.plan(replace(request, tick=129))
     for one in (first, last):
@@ -109,13 +109,13 @@ def near(discs: list[tuple[float, ...]], seconds: float) -> tuple[float, float]:
     weights = Weights(disc=9.0, disc_over=0.3, disc_lead=0.1, trust=0.7)
     state = np.zeros(STATE)
     state[COSINE : COSINE + LANES] = 1.0
-    state[X : X + LANES - 1] = 50.0  # the others are elsewhere
+    state[X : X + LANES - 1] = 50.0  # the other lanes are far away
     cost.fill_disc_distances(weights, np.array(discs), outline_of(JACKAL.footprint), seconds, state)
     assert (state[DISC_DISTANCE], state[DISC_COST]) == (NO_DISC_M, 0.0)
     return float(state[DISC_DISTANCE + LANES - 1]), float(state[DISC_COST + LANES - 1])
 
 
-def test_who_is_faster_costs_more_from_the_same_distance() -> None:
+def test_a_faster_disc_costs_more_at_the_same_distance() -> None:
     slow = (1.0, 0.0, 0.0, 0.0, 0.3, 0.0)
     quick = (1.0, -2.0, 0.0, 2.0, 0.3, 0.0)
     away, cost = near([slow], 1.0)
@@ -128,7 +128,7 @@ def test_who_is_faster_costs_more_from_the_same_distance() -> None:
     assert near([quick], 0.0)[0] == pytest.approx(math.hypot(0.771, 1.792) - 0.3)
 
 
-def test_a_plan_goes_on_as_it_was_where_its_steps_become_longer() -> None:
+def test_a_plan_is_resampled_when_its_steps_become_longer() -> None:
     sampler = Sampler(model_of(JACKAL), 64, 30, 0.05, 0)
     times = (np.arange(30) + 0.5) * 0.05
     sampler.last = np.tile(times[:, None], 3)
@@ -138,7 +138,7 @@ def test_a_plan_goes_on_as_it_was_where_its_steps_become_longer() -> None:
     assert sampler.last[:, 0] == pytest.approx(want)
 
 
-def test_what_moves_takes_its_hits_along_and_a_wall_beside_it_stays() -> None:
+def test_hits_of_a_moving_disc_are_cleared_but_not_those_of_a_wall() -> None:
     window, here = LocalCostmap(4.0, 10.0), Pose2D(0.0, 0.0, 0.0)
     beside = wall((0.4, 0.38), (1.6, 0.38))
     for tick in range(1, 40, 2):
@@ -148,13 +148,13 @@ def test_what_moves_takes_its_hits_along_and_a_wall_beside_it_stays() -> None:
         moving = np.array([(x, 0.0, -1.0, 0.0, 0.3, 0.0)])
         assert len(window.moving(tick, moving)) == 1
         window.clear_tracks(tick, moving)
-    left = window.grid(39, NOTHING, NOBODY).distance
+    left = window.grid(39, NO_POINTS, NO_DISCS).distance
     assert left[80, 80 + 32] == pytest.approx(0.38, abs=0.04)
     assert left[80 + 15, 80 + 32] < 0.03
 
 
 @pytest.mark.slow
-def test_a_stream_of_quick_discs_is_crossed_on_the_hard_plant() -> None:
+def test_a_stream_of_quick_discs_is_crossed_under_hard_conditions() -> None:
     lanes = [
         MovingDisc(8.0, np.array([(0.0, 3.0 + i % 2, s * 6.4), (8.0, 3.0 + i % 2, -s * 6.4)]), 0.5)
         for i, s in enumerate((1.0, -1.0))

@@ -1,4 +1,4 @@
-"""Bounds of the cost to a goal: never above the cost itself, and close to it."""
+"""Bounds of the cost to a goal: never above the cost, and close to it."""
 
 import numpy as np
 import pytest
@@ -21,7 +21,7 @@ def bounds_of(cost: np.ndarray, start: Cell, goal: Cell) -> np.ndarray:
 
 
 def rooms(seed: int, shape: tuple[int, int]) -> np.ndarray:
-    """Patches of any cost, some of them lethal, with noise of single cells."""
+    """Return patches of random cost, some lethal, with noise in single cells."""
     rng = np.random.default_rng(seed)
     cost = rng.uniform(1, 6, shape)
     for _ in range(12):
@@ -33,7 +33,7 @@ def rooms(seed: int, shape: tuple[int, int]) -> np.ndarray:
 
 @pytest.mark.parametrize("shape", [(40, 33), (1, 30), (37, 4), (32, 32)])
 @pytest.mark.parametrize("seed", range(4))
-def test_no_way_costs_less_than_its_bound(seed: int, shape: tuple[int, int]) -> None:
+def test_no_path_costs_less_than_its_bound(seed: int, shape: tuple[int, int]) -> None:
     cost, rng = rooms(seed, shape), np.random.default_rng(seed)
     for _ in range(4):
         start, goal = (tuple(int(rng.integers(0, side)) for side in shape) for _ in range(2))
@@ -42,7 +42,7 @@ def test_no_way_costs_less_than_its_bound(seed: int, shape: tuple[int, int]) -> 
 
 
 @pytest.mark.parametrize("seed", range(8))
-def test_no_step_costs_less_than_the_bound_falls_by_it(seed: int) -> None:
+def test_the_bound_falls_by_at_most_the_cost_of_a_step(seed: int) -> None:
     cost = rooms(seed, (40, 33))
     bounds = bounds_of(cost, (2, 3), (35, 28))
     for down, right in ((0, 1), (1, 0), (1, 1), (1, -1)):
@@ -52,7 +52,7 @@ def test_no_step_costs_less_than_the_bound_falls_by_it(seed: int) -> None:
         assert (np.abs(bounds[one] - bounds[other]) <= step * (1 + 1e-5)).all()
 
 
-def test_round_a_wall_the_bound_is_close() -> None:
+def test_the_bound_is_tight_around_a_wall() -> None:
     cost = np.ones((80, 80), np.float32)
     cost[30:40, :70] = 200.0
     cheapest = GridSearch().field(cost, (10, 10), "to")
@@ -61,7 +61,7 @@ def test_round_a_wall_the_bound_is_close() -> None:
 
 
 @pytest.mark.parametrize("seed", range(6))
-def test_no_way_costs_less_than_its_bound_after_changes(seed: int) -> None:
+def test_no_path_costs_less_than_its_bound_after_changes(seed: int) -> None:
     cost, rng, goal = rooms(seed, (60, 50)), np.random.default_rng(seed), (55, 40)
     bound = towards(goal, (5, 5), cost, block_bounds(cost.shape))
     for _ in range(20):
@@ -72,11 +72,11 @@ def test_no_way_costs_less_than_its_bound_after_changes(seed: int) -> None:
             assert bound_after_changes(bound, cost, start) <= cheapest[start]
 
 
-def test_a_cheaper_block_far_aside_leaves_the_bound_as_it_is() -> None:
+def test_a_cheaper_block_far_aside_does_not_change_the_bound() -> None:
     cost = np.full((100, 100), 2.0, np.float32)
     bound = towards((10, 90), (10, 10), cost, block_bounds(cost.shape))
     before = bound_after_changes(bound, cost, (10, 10))
     cost[90:, 50:60] = 1.0
     assert bound_after_changes(bound, cost, (10, 10)) == before > 150
-    cost[10, 50:60] = 1.0  # the straight way to there may cost 1 a cell as well, for all it knows
+    cost[10, 50:60] = 1.0  # as cheap as the bound assumes for the straight line to there
     assert 100 < bound_after_changes(bound, cost, (10, 10)) < 120

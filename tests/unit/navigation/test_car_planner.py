@@ -28,7 +28,7 @@ Wall = tuple[float, float, float, float]  # x from, to; y from, to [m]
 
 
 def world(width: float, height: float, *walls: Wall) -> Costmap:
-    """A walled rectangle from (0, 0), with walls in it."""
+    """Return a walled rectangle from (0, 0) with `walls` in it."""
     cells = np.zeros((round(height / CELL), round(width / CELL)), np.int8)
     cells[[0, -1]] = 100
     cells[:, [0, -1]] = 100
@@ -51,7 +51,7 @@ def path_of(costs: Costmap, start: Pose, goal: Goal) -> Path:
 
 
 def assert_drivable(path: Path, costs: Costmap) -> None:
-    """Check what a car can do, and its whole footprint against each cell, without the planner."""
+    """Check curvatures, and the whole footprint against each cell, without the planner."""
     assert path.headings is not None
     yaw, direction = path.headings.T
     steps, turns = np.diff(path.points, axis=0), np.diff(np.unwrap(yaw))
@@ -86,13 +86,13 @@ def test_it_ends_at_the_goal_with_the_heading(yaw: float) -> None:
     assert math.remainder(path.headings[-1, 0] - yaw, math.tau) == pytest.approx(0.0, abs=1e-6)
 
 
-def test_in_the_open_it_drives_straight_on() -> None:
+def test_without_obstacles_it_drives_straight() -> None:
     path = path_of(world(6.0, 4.0), Pose(x=1.0, y=2.0, yaw=0.0), Goal(x=5.0, y=2.0))
     assert path.remaining[0] == pytest.approx(4.0, abs=0.05)
     assert switches(path) == 0
 
 
-def test_a_place_a_little_behind_is_reached_in_reverse() -> None:
+def test_a_goal_close_behind_is_reached_in_reverse() -> None:
     path = path_of(world(6.0, 4.0), Pose(x=3.0, y=2.0, yaw=0.0), Goal(x=2.2, y=2.0, yaw=0.0))
     assert path.remaining[0] == pytest.approx(0.8, abs=0.05)
     assert path.headings is not None
@@ -107,7 +107,7 @@ def test_it_turns_round_in_a_dead_end() -> None:
     assert switches(path) >= 1
 
 
-def test_out_of_a_lane_in_which_it_cannot_turn_it_backs() -> None:
+def test_it_reverses_out_of_a_lane_in_which_it_cannot_turn() -> None:
     """A lane of 0.6 m opens into a hall, in which the car turns."""
     costs = world(6.0, 4.0, (3.0, 6.0, 0.0, 1.7), (3.0, 6.0, 2.3, 4.0))
     path = path_of(costs, Pose(x=5.2, y=2.0, yaw=0.0), Goal(x=1.0, y=2.0, yaw=math.pi))
@@ -117,7 +117,7 @@ def test_out_of_a_lane_in_which_it_cannot_turn_it_backs() -> None:
     assert (path.headings[in_lane, 1] == -1.0).all()
 
 
-def test_goals_that_it_cannot_have_are_refused_with_the_reason() -> None:
+def test_unreachable_goals_are_refused_with_the_reason() -> None:
     costs = world(5.0, 5.0, (2.5, 2.6, 0.0, 5.0))
     planner = PathPlanner()
     here = Pose(x=1.0, y=1.0, yaw=0.0)

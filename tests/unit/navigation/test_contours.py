@@ -1,4 +1,4 @@
-"""Contours of cameras in the planners: in the way, out of it, and remembered where nobody looks."""
+"""Contours of cameras in the planners: avoided, removed, and remembered out of sight."""
 
 import math
 
@@ -18,21 +18,21 @@ from gigabrain_zenoh.navigation.local_planner import LocalPlan, PlanRequest
 from gigabrain_zenoh.testing.samples import ARMED, WRIST
 from tests.unit.navigation.drives import WAFFLE, Drive, wall
 
-NOTHING = np.empty((0, 2))
+NO_POINTS = np.empty((0, 2))
 SEEING = replace(WAFFLE, cameras=(Camera(name="front", depth=True, depth_max=5.0),))
 ORIGIN = Pose(x=0.0, y=0.0, yaw=0.0)
 TABLE = np.array(((0.7, -0.3), (1.0, -0.3), (1.0, 0.25), (0.7, 0.25)))
 
 
 def box(x: float, y: float, half: float = 0.1) -> Floats:
-    """The corners of a square (4, 2) [m]."""
+    """Return the corners of a square (4, 2) [m]."""
     return np.array(
         ((x - half, y - half), (x + half, y - half), (x + half, y + half), (x - half, y + half))
     )
 
 
 class Seen(Drive):
-    """A drive among contours, that no beam of the lidar hits."""
+    """A drive among contours that the lidar does not see."""
 
     def __init__(self, goal: Goal, *contours: Floats) -> None:
         outlines = [
@@ -40,20 +40,20 @@ class Seen(Drive):
             for one in contours
             for a, b in zip(one, np.roll(one, -1, axis=0), strict=True)
         ]
-        super().__init__(SEEING, goal, np.concatenate(outlines) if outlines else NOTHING)
+        super().__init__(SEEING, goal, np.concatenate(outlines) if outlines else NO_POINTS)
         self.contours = contours
 
     def request(self) -> PlanRequest:
         from dataclasses import replace
 
-        return replace(super().request(), hits=NOTHING, contours=self.contours)
+        return replace(super().request(), hits=NO_POINTS, contours=self.contours)
 
 
 def kinds(plans: list[LocalPlan]) -> set[str]:
     return {plan.kind for plan in plans}
 
 
-def test_the_local_planner_goes_round_what_only_a_camera_sees() -> None:
+def test_the_local_planner_avoids_obstacles_that_only_a_camera_sees() -> None:
     drive = Seen(Goal(x=1.8, y=0.0), TABLE)
     assert drive.go(30.0).arrived
     assert drive.least > 0.0
@@ -61,7 +61,7 @@ def test_the_local_planner_goes_round_what_only_a_camera_sees() -> None:
 
 
 @pytest.mark.long
-def test_a_contour_that_is_gone_is_gone_at_once() -> None:
+def test_a_removed_contour_has_no_effect_at_once() -> None:
     line = np.array(((0.6, -6.0), (0.65, -6.0), (0.65, 6.0), (0.6, 6.0)))
     drive = Seen(Goal(x=1.5, y=0.0), line)
     drive.go(4.0)
@@ -71,7 +71,7 @@ def test_a_contour_that_is_gone_is_gone_at_once() -> None:
 
 
 def test_without_contours_plans_are_bit_equal() -> None:
-    plain, seen = Drive(WAFFLE, Goal(x=1.0, y=0.3), NOTHING), Seen(Goal(x=1.0, y=0.3))
+    plain, seen = Drive(WAFFLE, Goal(x=1.0, y=0.3), NO_POINTS), Seen(Goal(x=1.0, y=0.3))
     plain.go(3.0)
     seen.go(3.0)
     assert plain.poses == seen.poses
@@ -79,7 +79,7 @@ def test_without_contours_plans_are_bit_equal() -> None:
 
 @pytest.mark.long
 @pytest.mark.parametrize("far", [1e5, 1e3, 60.0])
-def test_contours_of_extreme_size_are_borne(far: float) -> None:
+def test_contours_of_extreme_size_are_accepted(far: float) -> None:
     line = np.array(((1.0, -far), (1.02, -far), (1.02, far), (1.0, far)))
     drive = Seen(Goal(x=2.0, y=0.0))
     drive.contours = (line, box(far, far), box(-far, 0.0, 50.0)) * 40
@@ -93,7 +93,7 @@ def test_a_body_within_a_contour_can_leave_it() -> None:
     assert drive.go(15.0).arrived
 
 
-def test_the_contour_of_what_moves_is_left_to_its_disc() -> None:
+def test_the_contour_of_a_moving_disc_is_ignored() -> None:
     discs = np.array([[1.0, 0.0, 0.5, 0.0, 0.3, 0.0]])
     person, table = box(1.1, 0.1), box(2.0, 0.0)
     assert static_polygons((person, table), discs) == (table,)
@@ -129,7 +129,7 @@ def test_no_polygons_cover_nothing() -> None:
 
 
 class TestContourMemory:
-    """Contours that the route planner remembers."""
+    """Contours that the global planner remembers."""
 
     def test_it_covers_the_polygons(self) -> None:
         memory = ContourMemory()

@@ -60,7 +60,7 @@ def test_the_body_fits_from_its_half_width_on_and_cost_falls_from_there() -> Non
     assert cost[-1] == 1.0
 
 
-def test_half_fifty_is_an_obstacle_and_less_is_not() -> None:
+def test_cells_from_fifty_percent_on_are_obstacles() -> None:
     cells = empty(4.0, 2.0)
     cells[10, 10], cells[10, 30] = 50, 49
     cost = costmap(grid_of(cells), RULES).cost
@@ -106,7 +106,7 @@ def test_unknown_space_costs_what_the_policy_says(unknown: Unknown, expected: fl
     assert cost[5, 40] == 1.0
 
 
-def test_points_that_the_map_lacks_are_obstacles() -> None:
+def test_additional_points_are_obstacles() -> None:
     grid, points = grid_of(empty(4.0, 2.0)), np.array([[1.05, 1.05], [9.0, 1.0], [-0.01, 1.0]])
     made = costmap(grid, RULES, points)
     assert made.cost[10, 10] == 200.0
@@ -115,7 +115,7 @@ def test_points_that_the_map_lacks_are_obstacles() -> None:
 
 
 @pytest.mark.parametrize("seed", range(8))
-def test_what_is_computed_after_a_change_is_what_all_anew_would_be(seed: int) -> None:
+def test_a_partial_update_equals_a_full_computation(seed: int) -> None:
     rng = np.random.default_rng(seed)
     cells = rng.choice(np.array([0, 0, 0, 0, 0, 0, 0, 0, 0, 100, -1], np.int8), (150, 200))
     before = costmap(grid_of(cells), RULES)
@@ -129,7 +129,7 @@ def test_what_is_computed_after_a_change_is_what_all_anew_would_be(seed: int) ->
     np.testing.assert_array_equal(before.cost, kept)
 
 
-def test_reused_costs_are_renewed_in_place() -> None:
+def test_reused_costs_are_updated_in_place() -> None:
     cells = empty(8.0, 8.0)
     before = costmap(grid_of(cells), RULES)
     cells[10, 20] = 100
@@ -138,13 +138,13 @@ def test_reused_costs_are_renewed_in_place() -> None:
     np.testing.assert_array_equal(after.cost, costmap(grid_of(cells), RULES).cost)
 
 
-def test_a_map_that_has_not_changed_costs_nothing_new() -> None:
+def test_an_unchanged_map_has_the_same_costs() -> None:
     grid = grid_of(wall())
     before = costmap(grid, RULES)
     assert costmap(grid, RULES, None, before).cost is before.cost
 
 
-def test_a_map_that_has_grown_or_moved_is_computed_anew() -> None:
+def test_a_map_that_has_grown_or_moved_is_computed_again() -> None:
     before = costmap(grid_of(wall()), RULES)
     grown = grid_of(np.pad(wall(), 5, constant_values=-1))
     moved = msgspec.structs.replace(grid_of(wall()), origin_x=1.0)
@@ -170,7 +170,7 @@ def test_an_empty_map_has_no_cells() -> None:
     assert made.cell(0.0, 0.0) is None
 
 
-def test_a_large_body_in_a_map_of_tiny_cells_asks_for_bounded_memory() -> None:
+def test_a_large_body_in_tiny_cells_needs_bounded_memory() -> None:
     grid = grid_of(empty(0.06, 0.06, 0.001), 0.001)
     tracemalloc.start()
     try:

@@ -16,27 +16,27 @@ def seen(cells: np.ndarray) -> Costmap:
 
 
 def room(width: int = 40, height: int = 30) -> np.ndarray:
-    """A closed room, known all over."""
+    """Return a closed room without unknown cells."""
     cells = np.zeros((height, width), np.int8)
     cells[0] = cells[-1] = cells[:, 0] = cells[:, -1] = 100
     return cells
 
 
-def test_a_room_that_is_closed_and_known_is_mapped() -> None:
+def test_a_closed_known_room_has_no_frontier() -> None:
     assert next_frontier(seen(room()), HERE, (), GridSearch()) is None
 
 
-def test_the_edge_of_the_known_is_the_frontier() -> None:
+def test_the_edge_of_known_space_is_the_frontier() -> None:
     cells = room()
     cells[1:-1, 30:-1] = -1
     found = next_frontier(seen(cells), HERE, (), GridSearch())
     assert found is not None
-    assert (found.x, found.y) == pytest.approx((2.95, 1.45), abs=0.06)  # the middle of the edge
-    assert found.size == pytest.approx(2.6)  # 2.8 m without what is too close to the walls
+    assert (found.x, found.y) == pytest.approx((2.95, 1.45), abs=0.06)  # middle of the edge
+    assert found.size == pytest.approx(2.6)  # of 2.8 m, less the cells too close to the walls
     assert found.cost == pytest.approx(1.5 + 0.4 * (np.sqrt(2)), abs=0.6)
 
 
-def test_the_nearer_of_two_alike_is_taken() -> None:
+def test_the_nearer_of_two_equal_frontiers_is_chosen() -> None:
     cells = room(80)
     cells[1:-1, 1:4] = cells[1:-1, -10:-1] = -1
     near = next_frontier(seen(cells), (1.05, 1.45), (), GridSearch())
@@ -46,7 +46,7 @@ def test_the_nearer_of_two_alike_is_taken() -> None:
     assert (near.x, far.x) == pytest.approx((0.45, 6.95))
 
 
-def test_a_larger_one_is_worth_some_way() -> None:
+def test_a_larger_frontier_is_worth_a_longer_path() -> None:
     cells = room(60)
     cells[1:-1, -6:-1] = -1  # 2.4 m of edge, 3 m away
     cells[10:16, 1:4] = -1  # 0.9 m of edge, 2 m away
@@ -55,7 +55,7 @@ def test_a_larger_one_is_worth_some_way() -> None:
     assert found.x == pytest.approx(5.35)
 
 
-def test_what_is_narrower_than_the_body_does_not_count() -> None:
+def test_frontiers_narrower_than_the_body_do_not_count() -> None:
     cells = room()
     cells[10:12, 20] = -1  # 2 x 2 cells of edge about it, 0.3 m is the body
     cells[10, 20] = 0
@@ -67,7 +67,7 @@ def test_what_is_narrower_than_the_body_does_not_count() -> None:
     assert next_frontier(seen(cells), HERE, (), GridSearch()) is None
 
 
-def test_what_cannot_be_reached_does_not_count() -> None:
+def test_unreachable_frontiers_do_not_count() -> None:
     cells = room(80)
     cells[:, 40] = 100
     cells[1:-1, 60:-1] = -1
@@ -76,15 +76,15 @@ def test_what_cannot_be_reached_does_not_count() -> None:
     assert next_frontier(seen(cells), HERE, (), GridSearch()) is not None
 
 
-def test_nothing_is_reached_through_what_is_unknown() -> None:
+def test_frontiers_behind_unknown_space_do_not_count() -> None:
     cells = room(80)
     cells[1:-1, 40:50] = -1
     found = frontiers(seen(cells), HERE, (), GridSearch())
     assert [one.x for one in found] == pytest.approx([3.95])
 
 
-def test_what_was_given_up_is_not_asked_for_again() -> None:
-    """Giving up one place after another ends, whatever the map never shows."""
+def test_blacklisted_frontiers_are_not_returned_again() -> None:
+    """Blacklisting one place after another ends the exploration."""
     cells = room()
     cells[1:-1, 30:-1] = -1
     made, given_up, search = seen(cells), [], GridSearch()
@@ -98,7 +98,7 @@ def test_what_was_given_up_is_not_asked_for_again() -> None:
     assert 2 <= len(given_up) <= 4
 
 
-def test_a_place_of_the_blacklist_outside_the_map_takes_nothing_away() -> None:
+def test_a_blacklisted_place_outside_the_map_has_no_effect() -> None:
     cells = room()
     cells[1:-1, 30:-1] = -1
     made, search = seen(cells), GridSearch()
@@ -106,7 +106,7 @@ def test_a_place_of_the_blacklist_outside_the_map_takes_nothing_away() -> None:
     assert frontiers(made, HERE, anywhere, search) == frontiers(made, HERE, (), search)
 
 
-def test_free_space_at_the_rim_of_the_map_goes_on() -> None:
+def test_free_space_at_the_rim_of_the_map_is_a_frontier() -> None:
     cells = room()
     cells[:, -1] = 0
     found = next_frontier(seen(cells), HERE, (), GridSearch())
@@ -118,8 +118,8 @@ def test_a_robot_outside_the_map_sees_no_frontier() -> None:
     assert frontiers(seen(room()), (-5.0, 0.0), (), GridSearch()) == []
 
 
-def test_a_robot_that_stands_in_unknown_cells_finds_out_of_them() -> None:
-    """Below a lidar's least range nothing is known at first."""
+def test_a_robot_in_unknown_cells_finds_frontiers() -> None:
+    """At first, cells within the lidar's minimum range are unknown."""
     cells = room()
     cells[8:13, 8:13] = -1
     cells[1:-1, 30:-1] = -1

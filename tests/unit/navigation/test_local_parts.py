@@ -1,4 +1,4 @@
-"""The parts of the local planner, each against what is known without it."""
+"""Parts of the local planner, each compared with an independent result."""
 
 import itertools
 import math
@@ -35,8 +35,8 @@ from gigabrain_zenoh.navigation.motion_model import (
 from gigabrain_zenoh.navigation.mppi import mean_past_commands
 from tests.unit.navigation.drives import CAR, OMNI, WAFFLE, wall
 
-NOBODY = np.empty((0, 6))
-NOTHING = np.empty((0, 2))
+NO_DISCS = np.empty((0, 6))
+NO_POINTS = np.empty((0, 2))
 
 
 def clearance(grid: DistanceGrid, outline: Outline, at: Placement) -> float:
@@ -52,7 +52,7 @@ def test_a_car_turns_no_more_tightly_than_at_full_speed_and_lock() -> None:
     assert (vx, w) == (0.4, 0.8)
 
 
-def test_a_command_changes_no_faster_than_the_body_can() -> None:
+def test_commands_respect_the_acceleration_limits() -> None:
     model = model_of(WAFFLE)
     vx, vy, w = feasible(model, (0.0, 0.0, 0.0), (1.0, 1.0, 9.0), 0.1)
     assert (vx, vy, w) == pytest.approx((0.09, 0.0, 0.27))
@@ -60,7 +60,7 @@ def test_a_command_changes_no_faster_than_the_body_can() -> None:
     assert feasible(model, (0.0, 0.0, 0.0), (-1.0, 0.0, 0.0), 9.0)[0] == -0.13
 
 
-def test_a_wheel_is_never_planned_to_be_faster_than_it_can_be() -> None:
+def test_planned_wheel_speeds_respect_their_limit() -> None:
     model = model_of(replace(WAFFLE, wheel_separation=0.28, max_rim_speed=0.26))
     vx, _, w = feasible(model, (0.0, 0.0, 0.0), (0.26, 0.0, 1.82), 9.0)
     assert vx + 0.14 * w == pytest.approx(0.26)
@@ -68,7 +68,7 @@ def test_a_wheel_is_never_planned_to_be_faster_than_it_can_be() -> None:
     assert feasible(model, (0.0, 0.0, 0.0), (0.26, 0.0, 0.0), 9.0) == (0.26, 0.0, 0.0)
 
 
-def test_no_body_is_planned_to_be_faster_aslant_than_straight_on() -> None:
+def test_planned_slanted_speeds_respect_the_ellipse() -> None:
     still, plans = (0.0, 0.0, 0.0), np.full((2, 3, LANES), 0.6)
     lag = first_order_lag(0.0, 9.0)
     start = InitialState(*still, *still, still, np.zeros((1, 3)), 0.0, lag, 1.0)
@@ -77,13 +77,13 @@ def test_no_body_is_planned_to_be_faster_aslant_than_straight_on() -> None:
     assert plans[:, 0] == pytest.approx(plans[:, 1])
 
 
-def test_a_slower_speed_can_be_asked_for() -> None:
+def test_a_slower_speed_can_be_requested() -> None:
     assert model_of(WAFFLE, 0.1).forward == 0.1
     assert model_of(WAFFLE, 9.0).forward == 0.26
 
 
 @pytest.mark.parametrize("late", [0.02, 0.1, 0.5])
-def test_a_body_that_reacts_later_is_driven_so_that_it_needs_no_longer_to_stop(late: float) -> None:
+def test_a_delayed_body_keeps_its_stopping_distance(late: float) -> None:
     model = model_of(WAFFLE)
     slow = delayed_model(model, late)
 
@@ -103,7 +103,7 @@ def test_a_lag_closes_the_gap_by_the_same_share_in_each_step() -> None:
     assert lagged_step(0.0, 1.0, first_order_lag(0.0, 0.05), 0.05) == (1.0, 0.05)
 
 
-def test_commands_on_their_way_are_averaged_over_each_step() -> None:
+def test_past_commands_are_averaged_over_each_step() -> None:
     sent = np.array([(-0.10, 1.0, 0.0, 0.0), (-0.06, 2.0, 0.0, 0.5)])
     past, share = mean_past_commands(sent, (0.0, 0.0, 0.0), 0.12, 0.05)
     assert share == pytest.approx(0.4)
@@ -118,7 +118,7 @@ def test_clearance_is_the_outlines_distance_to_the_nearest_obstacle() -> None:
     points = random.uniform(-1.5, 1.5, (25, 2))
     points = points[np.hypot(points[:, 0], points[:, 1]) > 0.5]
     window.add_scan(1, Pose2D(0.0, 0.0, 0.0), (0.0, 0.0), points)
-    grid, outline = window.grid(1, NOTHING, NOBODY), outline_of(WAFFLE.footprint)
+    grid, outline = window.grid(1, NO_POINTS, NO_DISCS), outline_of(WAFFLE.footprint)
     for x, y, yaw in random.uniform((-0.3, -0.3, -3.0), (0.3, 0.3, 3.0), (50, 3)).tolist():
         got = clearance(grid, outline, Placement(x, y, math.cos(yaw), math.sin(yaw)))
         want = min(0.4, _exact(points, x, y, yaw))
@@ -126,7 +126,7 @@ def test_clearance_is_the_outlines_distance_to_the_nearest_obstacle() -> None:
 
 
 def _exact(points: np.ndarray, x: float, y: float, yaw: float) -> float:
-    """From the waffle's box, by hand."""
+    """Return the clearance of the waffle's box."""
     off = points - (x, y)
     ahead = math.cos(yaw) * off[:, 0] + math.sin(yaw) * off[:, 1]
     aside = math.cos(yaw) * off[:, 1] - math.sin(yaw) * off[:, 0]
@@ -137,7 +137,7 @@ def _exact(points: np.ndarray, x: float, y: float, yaw: float) -> float:
     return float(out.min())
 
 
-def test_distances_are_those_of_opencv_and_no_more_than_asked_for() -> None:
+def test_distances_equal_those_of_opencv_up_to_the_limit() -> None:
     random = np.random.default_rng(4)
     for share, side in itertools.product((1.0, 0.5, 0.01, 0.001, 0.0), (90, 64)):
         chamfer = Chamfer(side, 0.025, 0.8)
@@ -147,7 +147,7 @@ def test_distances_are_those_of_opencv_and_no_more_than_asked_for() -> None:
 
 
 @pytest.mark.parametrize("body", [WAFFLE, CAR])
-def test_no_point_of_the_outline_that_is_left_out_would_have_been_nearer(
+def test_skipped_points_of_the_outline_are_never_nearer(
     body: BodyDescription,
 ) -> None:
     random = np.random.default_rng(5)
@@ -170,7 +170,7 @@ def test_no_point_of_the_outline_that_is_left_out_would_have_been_nearer(
 
 
 def _bilinear(distance: np.ndarray, at: np.ndarray) -> np.ndarray:
-    """Of cells of 25 mm, at points (2, n) [m] from their corner; beyond the rim as on it."""
+    """Interpolate cells of 25 mm at points (2, n) [m] from their corner, limited to the grid."""
     v, u = np.clip(at[::-1] / 0.025 - 0.5, 0.0, np.array(distance.shape)[:, None] - 2.0)
     i, j = v.astype(int), u.astype(int)
     low = distance[i, j] + (u - j) * (distance[i, j + 1] - distance[i, j])
@@ -178,66 +178,66 @@ def _bilinear(distance: np.ndarray, at: np.ndarray) -> np.ndarray:
     return np.asarray(low + (v - i) * (high - low))
 
 
-def test_what_is_inside_the_body_leaves_no_clearance() -> None:
+def test_an_obstacle_inside_the_body_leaves_no_clearance() -> None:
     distance = np.full((80, 80), 3.0, dtype=np.float32)
     distance[30:50, 30:50] = 0.0
     grid = DistanceGrid(distance, 0.025, -1.0, -1.0)
     assert clearance(grid, outline_of(WAFFLE.footprint), Placement(0.06, 0.0, 1.0, 0.0)) < 0.0
 
 
-def test_the_way_straight_on_ends_at_a_wall() -> None:
+def test_the_free_distance_ahead_ends_at_a_wall() -> None:
     window = LocalCostmap(4.0, 10.0)
     window.add_scan(1, Pose2D(0.0, 0.0, 0.0), (0.0, 0.0), wall((0.9, -0.5), (0.9, 0.5)))
-    grid, outline = window.grid(1, NOTHING, NOBODY), outline_of(WAFFLE.footprint)
+    grid, outline = window.grid(1, NO_POINTS, NO_DISCS), outline_of(WAFFLE.footprint)
     free = free_ahead(grid, outline, Placement(0.0, 0.0, 1.0, 0.0), 1.0, 0.03, 2.0)
     assert free == pytest.approx(0.8, abs=0.05)
     assert free_ahead(grid, outline, Placement(0.0, 0.0, 1.0, 0.0), -1.0, 0.03, 2.0) == 2.0
 
 
-def test_what_has_moved_leaves_no_ghost() -> None:
+def test_a_moved_obstacle_leaves_no_marks() -> None:
     window, here = LocalCostmap(4.0, 10.0), Pose2D(0.0, 0.0, 0.0)
     behind = wall((1.5, -0.5), (1.5, 0.5))
     window.add_scan(1, here, (0.0, 0.0), np.array([(0.8, 0.0)]))
-    assert window.grid(1, NOTHING, NOBODY).distance[80, 112] < 0.03
+    assert window.grid(1, NO_POINTS, NO_DISCS).distance[80, 112] < 0.03
     window.add_scan(6, here, (0.0, 0.0), behind)
-    assert window.grid(6, NOTHING, NOBODY).distance[80, 112] < 0.03  # one beam may err
+    assert window.grid(6, NO_POINTS, NO_DISCS).distance[80, 112] < 0.03  # one beam may be wrong
     window.add_scan(11, here, (0.0, 0.0), behind)
-    assert window.grid(11, NOTHING, NOBODY).distance[80, 112] == pytest.approx(0.7, abs=0.03)
+    assert window.grid(11, NO_POINTS, NO_DISCS).distance[80, 112] == pytest.approx(0.7, abs=0.03)
 
 
-def test_what_no_beam_can_check_is_believed_for_its_time() -> None:
+def test_marks_that_no_beam_can_check_expire() -> None:
     window, here = LocalCostmap(4.0, 1.0), Pose2D(0.0, 0.0, 0.0)
     window.add_scan(1, here, (0.0, 0.0), np.array([(-0.8, 0.0)]))
     window.add_scan(50, here, (0.0, 0.0), np.array([(0.8, 0.0)]))
-    assert window.grid(50, NOTHING, NOBODY).distance[80, 48] < 0.03
+    assert window.grid(50, NO_POINTS, NO_DISCS).distance[80, 48] < 0.03
     window.add_scan(52, here, (0.0, 0.0), np.array([(0.8, 0.0)]))
-    assert window.grid(52, NOTHING, NOBODY).distance[80, 48] > 1.0
+    assert window.grid(52, NO_POINTS, NO_DISCS).distance[80, 48] > 1.0
 
 
-def test_the_window_goes_with_the_robot_and_keeps_what_it_saw() -> None:
+def test_the_window_moves_with_the_robot_and_keeps_its_marks() -> None:
     window = LocalCostmap(4.0, 10.0)
     window.add_scan(1, Pose2D(0.0, 0.0, 0.0), (0.0, 0.0), np.array([(1.0, 0.5)]))
     window.add_scan(2, Pose2D(0.5, 0.0, math.pi / 2), (0.0, 0.0), np.array([(0.0, 1.2)]))
-    grid = window.grid(2, NOTHING, NOBODY)
+    grid = window.grid(2, NO_POINTS, NO_DISCS)
     for x, y in ((1.0, 0.5), (-0.7, 0.0)):
         row, column = int((y - grid.y) / 0.025), int((x - grid.x) / 0.025)
         assert grid.distance[row, column] < 0.03
 
 
 @pytest.mark.parametrize(("x", "y"), [(3.5, 0.0), (0.0, -3.5), (-2.5, 2.0), (9.0, 0.0)])
-def test_what_leaves_the_window_is_forgotten(x: float, y: float) -> None:
+def test_marks_outside_the_window_are_forgotten(x: float, y: float) -> None:
     window, around = LocalCostmap(4.0, 10.0), np.random.default_rng(6).uniform(-1.9, 1.9, (200, 2))
     window.add_scan(1, Pose2D(0.0, 0.0, 0.0), (0.0, 0.0), around)
-    there = _occupied(window.grid(1, NOTHING, NOBODY))
-    window.add_scan(2, Pose2D(x, y, 0.0), (0.0, 0.0), NOTHING)
+    there = _occupied(window.grid(1, NO_POINTS, NO_DISCS))
+    window.add_scan(2, Pose2D(x, y, 0.0), (0.0, 0.0), NO_POINTS)
     kept = {(a, b) for a, b in there if abs(a - 40 * x) <= 80 and abs(b - 40 * y) <= 80}
-    assert _occupied(window.grid(2, NOTHING, NOBODY)) == kept
-    window.add_scan(3, Pose2D(0.0, 0.0, 0.0), (0.0, 0.0), NOTHING)
-    assert _occupied(window.grid(3, NOTHING, NOBODY)) == kept < there
+    assert _occupied(window.grid(2, NO_POINTS, NO_DISCS)) == kept
+    window.add_scan(3, Pose2D(0.0, 0.0, 0.0), (0.0, 0.0), NO_POINTS)
+    assert _occupied(window.grid(3, NO_POINTS, NO_DISCS)) == kept < there
 
 
 def _occupied(grid: DistanceGrid) -> set[tuple[float, float]]:
-    """The middles of the occupied cells, in cells from the frame's origin."""
+    """Return the middles of the occupied cells, in cells from the frame's origin."""
     rows, columns = np.nonzero(grid.distance == 0.0)
     x, y = round(grid.x / 0.025), round(grid.y / 0.025)
     return {
@@ -247,13 +247,13 @@ def _occupied(grid: DistanceGrid) -> set[tuple[float, float]]:
 
 def test_known_points_of_the_map_count_and_are_not_remembered() -> None:
     window = LocalCostmap(4.0, 10.0)
-    window.add_scan(1, Pose2D(0.0, 0.0, 0.0), (0.0, 0.0), NOTHING)
+    window.add_scan(1, Pose2D(0.0, 0.0, 0.0), (0.0, 0.0), NO_POINTS)
     known = np.array([(0.5, 0.0), (99.0, 0.0)])
-    assert window.grid(1, known, NOBODY).distance[80, 100] < 0.03
-    assert window.grid(1, NOTHING, NOBODY).distance[80, 100] == 3.0
+    assert window.grid(1, known, NO_DISCS).distance[80, 100] < 0.03
+    assert window.grid(1, NO_POINTS, NO_DISCS).distance[80, 100] == 3.0
 
 
-def test_a_post_that_seems_to_move_is_believed_only_where_it_was_not_before() -> None:
+def test_a_post_that_seems_to_move_is_static_where_it_was_before() -> None:
     window, here = LocalCostmap(4.0, 10.0), Pose2D(0.0, 0.0, 0.0)
     claimed = np.array([(1.0, 0.0, 0.8, 0.0, 0.1, 0.1)])
     for tick in range(1, 32, 5):
@@ -266,7 +266,7 @@ def test_a_post_that_seems_to_move_is_believed_only_where_it_was_not_before() ->
 def test_the_way_to_the_goal_goes_round_a_wall() -> None:
     window = LocalCostmap(4.0, 10.0)
     window.add_scan(1, Pose2D(0.0, 0.0, 0.0), (0.0, 0.0), wall((0.8, -1.0), (0.8, 1.0)))
-    grid = window.grid(1, NOTHING, NOBODY)
+    grid = window.grid(1, NO_POINTS, NO_DISCS)
     field = CostToGo(window.cells).field(grid, 0.155, (1.6, 0.0), None)
     middle = field.distance.shape[0] // 2
     here = float(field.distance[middle, middle])
@@ -276,8 +276,8 @@ def test_the_way_to_the_goal_goes_round_a_wall() -> None:
 
 def test_a_path_is_followed_to_where_it_leaves_the_window() -> None:
     window = LocalCostmap(4.0, 10.0)
-    window.add_scan(1, Pose2D(0.0, 0.0, 0.0), (0.0, 0.0), NOTHING)
-    grid = window.grid(1, NOTHING, NOBODY)
+    window.add_scan(1, Pose2D(0.0, 0.0, 0.0), (0.0, 0.0), NO_POINTS)
+    grid = window.grid(1, NO_POINTS, NO_DISCS)
     path = np.array([(0.0, 0.1 * i) for i in range(60)])
     field = CostToGo(window.cells).field(grid, 0.155, (5.0, 5.0), path)
     row, column = np.unravel_index(int(np.argmin(field.distance)), field.distance.shape)
@@ -286,9 +286,9 @@ def test_a_path_is_followed_to_where_it_leaves_the_window() -> None:
     )
 
 
-def test_the_way_straight_on_is_looked_at_no_farther_than_the_window_is_large() -> None:
+def test_the_free_distance_ahead_is_searched_within_the_window_only() -> None:
     window = LocalCostmap(4.0, 10.0)
-    grid, outline = window.grid(1, NOTHING, NOBODY), outline_of(WAFFLE.footprint)
+    grid, outline = window.grid(1, NO_POINTS, NO_DISCS), outline_of(WAFFLE.footprint)
     found = list[float]()
     ways = (grid, outline, Placement(0.0, 0.0, 1.0, 0.0), 1.0, 0.03, 1e18)
     asking = threading.Thread(target=lambda: found.append(free_ahead(*ways)), daemon=True)
@@ -303,15 +303,15 @@ def test_the_outline_of_a_large_or_jagged_body_has_a_bounded_number_of_points() 
     assert 3 * len(outline.groups) < 600
 
 
-def test_a_goal_that_is_a_hundred_kilometres_off_is_as_far_as_anything() -> None:
-    grid = LocalCostmap(4.0, 10.0).grid(1, NOTHING, NOBODY)
+def test_the_cost_to_a_goal_at_a_hundred_kilometres_is_limited() -> None:
+    grid = LocalCostmap(4.0, 10.0).grid(1, NO_POINTS, NO_DISCS)
     field = CostToGo(160).field(grid, 0.15, (1e5, -1e5), None).distance
     assert 9_990.0 < field.min() <= field.max() <= 10_010.0
 
 
 @pytest.mark.parametrize("row", [-20, -3, 0, 20, 39, 60])
 @pytest.mark.parametrize("radius", [0, 1, 5, 30, 80])
-def test_a_disc_is_the_one_that_opencv_fills(row: int, radius: int) -> None:
+def test_filled_discs_equal_those_of_opencv(row: int, radius: int) -> None:
     mine, theirs = np.zeros((40, 30), np.uint8), np.zeros((40, 30), np.uint8)
     fill_disc(mine, row, 7, radius)
     cv2.circle(theirs, (7, row), radius, 1, cv2.FILLED)

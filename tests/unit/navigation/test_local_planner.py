@@ -1,4 +1,4 @@
-"""The local planner drives a body with delay and lag, on a clock of its own."""
+"""The local planner drives a body with delay and lag, on a simulated clock."""
 
 import math
 
@@ -13,7 +13,7 @@ from gigabrain_schemas.tasks import Goal
 from gigabrain_zenoh.navigation.local_planner import LocalPlanner, PlanRequest, SentCommand
 from tests.unit.navigation.drives import CAR, OMNI, QUICK, WAFFLE, Drive, wall
 
-NOTHING = np.empty((0, 2))
+NO_POINTS = np.empty((0, 2))
 LATE = ActuationModel(delay=0.1, lag=0.15)
 TRIKE = replace(CAR, drive_type="differential", robot_type="trike")
 DOOR = np.concatenate(
@@ -23,7 +23,7 @@ DOOR = np.concatenate(
 
 @pytest.mark.long
 def test_a_goal_is_reached_with_its_yaw() -> None:
-    drive = Drive(WAFFLE, Goal(x=0.8, y=0.4, yaw=-1.0), NOTHING, response=LATE)
+    drive = Drive(WAFFLE, Goal(x=0.8, y=0.4, yaw=-1.0), NO_POINTS, response=LATE)
     assert drive.go(20.0).arrived
     assert math.hypot(drive.pose.x - 0.8, drive.pose.y - 0.4) < 0.12
     assert abs(drive.pose.yaw + 1.0) < 0.15
@@ -32,15 +32,17 @@ def test_a_goal_is_reached_with_its_yaw() -> None:
 
 @pytest.mark.parametrize("body", [WAFFLE, TRIKE, OMNI])
 @pytest.mark.parametrize("yaw", [-0.4, 3.0])
-def test_who_is_there_and_looks_elsewhere_turns_at_once(body: BodyDescription, yaw: float) -> None:
-    drive = Drive(body, Goal(x=0.0, y=0.05, yaw=yaw), NOTHING, response=LATE)
+def test_a_body_at_the_goal_with_the_wrong_yaw_turns_at_once(
+    body: BodyDescription, yaw: float
+) -> None:
+    drive = Drive(body, Goal(x=0.0, y=0.05, yaw=yaw), NO_POINTS, response=LATE)
     assert drive.go(6.0).arrived
     assert abs(math.remainder(drive.pose.yaw - yaw, math.tau)) < 0.13
     assert math.hypot(drive.pose.x, drive.pose.y - 0.05) < 0.13
     assert "turning in place: at the goal" in {plan.reason for plan in drive.plans}
 
 
-def test_who_is_there_and_wants_no_yaw_stops_turning() -> None:
+def test_a_body_at_a_goal_without_yaw_stops_turning() -> None:
     request = PlanRequest(
         tick=1,
         pose=Pose(x=0.05, y=0.0, yaw=2.0),
@@ -70,7 +72,7 @@ def test_a_narrow_door_is_passed() -> None:
 
 
 @pytest.mark.parametrize("may_back", [True, False])
-def test_who_may_not_back_plans_no_way_backwards(may_back: bool) -> None:
+def test_a_body_that_may_not_reverse_plans_no_reversing(may_back: bool) -> None:
     planner = LocalPlanner(WAFFLE)
     ahead = wall((0.35, -0.5), (0.35, 0.5))
     request = PlanRequest(
@@ -87,7 +89,7 @@ def test_who_may_not_back_plans_no_way_backwards(may_back: bool) -> None:
     assert bool(backwards) == may_back
 
 
-def test_a_dead_end_is_left_backwards_or_by_turning() -> None:
+def test_a_dead_end_is_left_in_reverse_or_by_turning() -> None:
     pocket = np.concatenate(
         [wall((0.3, -0.26), (0.3, 0.26)), wall((-0.5, 0.26), (0.3, 0.26)),
          wall((-0.5, -0.26), (0.3, -0.26))]
@@ -99,18 +101,18 @@ def test_a_dead_end_is_left_backwards_or_by_turning() -> None:
     assert "backing out" in {plan.kind for plan in drive.plans}
 
 
-def test_a_body_that_has_to_go_far_the_other_way_turns_round() -> None:
-    drive = Drive(WAFFLE, Goal(x=-2.0, y=0.0), NOTHING, response=LATE)
+def test_a_body_with_a_goal_far_behind_turns_round() -> None:
+    drive = Drive(WAFFLE, Goal(x=-2.0, y=0.0), NO_POINTS, response=LATE)
     assert drive.go(15.0).arrived
     assert min(pose.x for pose in drive.poses if abs(pose.yaw) < 1.5) > -0.5
 
 
 @pytest.mark.parametrize("speed", [0.3, 0.6])
-def test_a_disc_that_comes_head_on_is_gone_round_or_let_pass(speed: float) -> None:
+def test_the_body_avoids_a_disc_that_comes_head_on(speed: float) -> None:
     def someone(now: float) -> tuple[Obstacle, ...]:
         return (Obstacle(id=1, x=2.5 - speed * now, y=0.05, velocity_x=-speed, radius=0.25),)
 
-    drive = Drive(TRIKE, Goal(x=3.0, y=0.0), NOTHING, response=LATE, someone=someone)
+    drive = Drive(TRIKE, Goal(x=3.0, y=0.0), NO_POINTS, response=LATE, someone=someone)
     drive.go(20.0)
     assert drive.least > 0.0
     assert math.hypot(drive.pose.x - 3.0, drive.pose.y) < 0.15
@@ -119,7 +121,7 @@ def test_a_disc_that_comes_head_on_is_gone_round_or_let_pass(speed: float) -> No
     assert any("somebody" in plan.reason for plan in drive.plans)
 
 
-def test_who_is_shut_in_says_that_another_way_is_wanted() -> None:
+def test_an_enclosed_body_reports_that_it_is_blocked() -> None:
     cell = np.concatenate(
         [wall((0.4, -0.4), (0.4, 0.4)), wall((-0.5, -0.4), (-0.5, 0.4)),
          wall((-0.5, 0.4), (0.4, 0.4)), wall((-0.5, -0.4), (0.4, -0.4))]
@@ -132,19 +134,19 @@ def test_who_is_shut_in_says_that_another_way_is_wanted() -> None:
 
 
 def test_a_car_never_turns_on_the_spot() -> None:
-    drive = Drive(CAR, Goal(x=-1.5, y=0.5), NOTHING, response=LATE)
+    drive = Drive(CAR, Goal(x=-1.5, y=0.5), NO_POINTS, response=LATE)
     drive.go(15.0)
     assert math.hypot(drive.pose.x + 1.5, drive.pose.y - 0.5) < 0.2
     for plan in drive.plans:
         assert abs(plan.twist.angular_z) <= abs(plan.twist.linear_x) / 0.5 + 1e-9
 
 
-def test_the_expected_trajectory_is_what_a_late_body_then_does() -> None:
-    drive = Drive(TRIKE, Goal(x=4.0, y=0.0), NOTHING, response=LATE)
+def test_a_delayed_body_follows_its_expected_trajectory() -> None:
+    drive = Drive(TRIKE, Goal(x=4.0, y=0.0), NO_POINTS, response=LATE)
     drive.go(1.0)
     request, start = drive.request(), drive.pose
     plan = drive.planner.plan(request)
-    # 0.1 s on, all of it decided by commands that had been sent before
+    # 0.1 s later; earlier commands alone decide the motion until then
     for _ in range(5):
         drive._tick(Velocity(linear_x=-9.9))
     dx, dy = drive.pose.x - start.x, drive.pose.y - start.y
@@ -155,7 +157,7 @@ def test_the_expected_trajectory_is_what_a_late_body_then_does() -> None:
     assert drive.velocity.angular_z == pytest.approx(expected.angular_z, abs=1e-3)
 
 
-def test_the_same_questions_get_the_same_answers() -> None:
+def test_the_same_requests_get_the_same_plans() -> None:
     runs = []
     for _ in range(2):
         drive = Drive(WAFFLE, Goal(x=1.6, y=0.0), DOOR)
@@ -167,10 +169,10 @@ def test_the_same_questions_get_the_same_answers() -> None:
 @pytest.mark.parametrize(
     "goal", [Goal(x=math.nan, y=0.0), Goal(x=0.0, y=math.inf), Goal(x=0.0, y=0.0, yaw=math.nan)]
 )
-def test_a_goal_that_is_no_place_is_refused(goal: Goal) -> None:
+def test_a_goal_that_is_not_finite_is_refused(goal: Goal) -> None:
     planner = LocalPlanner(WAFFLE, QUICK)
     request = PlanRequest(
-        tick=1, pose=Pose(x=0.0, y=0.0, yaw=0.0), velocity=Velocity(), goal=goal, hits=NOTHING,
+        tick=1, pose=Pose(x=0.0, y=0.0, yaw=0.0), velocity=Velocity(), goal=goal, hits=NO_POINTS,
         sent=(SentCommand(0, Velocity()),),
     )  # fmt: skip
     with pytest.raises(ValueError, match="a goal has finite numbers"):

@@ -1,4 +1,4 @@
-"""Ground that no camera has looked at costs like an obstacle near by, until it has been in view."""
+"""Unseen ground costs like a nearby obstacle until a camera has looked at it."""
 
 import dataclasses
 import math
@@ -44,7 +44,7 @@ def looked(
     return ground.limited(open_ground(), place, ("front",), outlines)
 
 
-def test_without_a_believed_camera_nothing_costs_more() -> None:
+def test_without_a_trusted_camera_no_ground_costs_more() -> None:
     ground = LookedGround(BODY, SIDE)
     for names in ((), ("rear",)):
         assert ground.limited(open_ground(), HERE, names, ()).distance.min() == MAX_DISTANCE_M
@@ -54,7 +54,7 @@ def test_without_a_believed_camera_nothing_costs_more() -> None:
     )
 
 
-def test_the_body_may_turn_where_it_was_put_down() -> None:
+def test_the_body_may_turn_at_its_start() -> None:
     grid = looked(LookedGround(BODY, SIDE))
     for bearing in np.linspace(-math.pi, math.pi, 24):
         assert at(grid, 0.25 * math.cos(bearing), 0.25 * math.sin(bearing)) >= 0.1
@@ -68,23 +68,23 @@ def test_ground_beside_and_behind_is_costly_until_it_has_been_in_view() -> None:
     grid = looked(ground, Pose2D(0.0, 0.0, math.pi / 2))
     assert at(grid, 0.0, 0.45) > 0.1
     assert at(grid, -0.45, 0.0) == pytest.approx(MARGIN_M)
-    assert at(looked(ground), 0.0, 0.45) > 0.1  # it is remembered
+    assert at(looked(ground), 0.0, 0.45) > 0.1  # still seen
 
 
-def test_what_is_far_from_the_body_is_open_still() -> None:
+def test_ground_far_from_the_body_is_free() -> None:
     grid = looked(LookedGround(BODY, SIDE))
     assert at(grid, 0.0, 1.0) > 0.3
     assert at(grid, -1.0, 0.0) > 0.3
 
 
-def test_what_stands_hides_what_is_behind_it() -> None:
+def test_an_outline_hides_the_ground_behind_it() -> None:
     box = np.array([(0.36, -0.1), (0.42, -0.1), (0.42, 0.1), (0.36, 0.1)])
     ground = LookedGround(BODY, SIDE)
     assert at(looked(ground, HERE, (box,)), 0.48, 0.0) == pytest.approx(MARGIN_M, abs=CELL_M)
     assert at(looked(ground), 0.48, 0.0) > 0.1
 
 
-def test_where_the_body_stood_is_known() -> None:
+def test_ground_on_which_the_body_stood_is_seen() -> None:
     ground = LookedGround(BODY, SIDE)
     for x in np.arange(0.0, 1.01, 0.1):
         grid = looked(ground, Pose2D(x, 0.0, 0.0))
@@ -116,9 +116,9 @@ def test_a_camera_sees_the_floor_from_where_its_lowest_row_meets_it() -> None:
 
 
 def deepest_in_unknown(names: tuple[str, ...], goal: Goal) -> float:
-    """Drive to a goal, and return how far it swept ground that was never in view [m].
+    """Drive to a goal, and return how deep the body entered unseen ground [m].
 
-    Negative where it kept away.
+    It is negative if the body kept away.
     """
 
     class SeeingDrive(Drive):
@@ -150,7 +150,7 @@ def test_it_keeps_away_from_ground_that_was_never_in_view() -> None:
 
 @pytest.mark.long
 @pytest.mark.parametrize("begins", [(-1.0, 0.3, 2.0), (-0.4, -0.9, -1.5), (-0.9, -0.2, 0.1)])
-def test_a_body_that_can_go_aside_gets_before_a_thing_from_wherever_it_looks(
+def test_a_strafing_body_reaches_an_object_at_any_heading(
     begins: tuple[float, float, float],
 ) -> None:
     body = load_robot("lekiwi").description()
@@ -168,7 +168,7 @@ def test_a_body_that_can_go_aside_gets_before_a_thing_from_wherever_it_looks(
 
 
 def with_gap(wide: float) -> LookedGround:
-    """Return ground that was looked at, but for a gap 0.2 m ahead."""
+    """Return seen ground with an unseen gap 0.2 m ahead."""
     ground = LookedGround(BODY, SIDE)
     looked(ground)
     ground._looked[:] = 1
@@ -190,7 +190,7 @@ def test_a_narrow_gap_is_filled_and_a_wide_one_stays(wide: float, filled: bool) 
 
 
 class StandingDrive(Drive):
-    """A body that stays where it is, whatever is planned."""
+    """A body that does not move."""
 
     def request(self) -> PlanRequest:
         return dataclasses.replace(super().request(), pose=Pose(x=0.0, y=0.0, yaw=0.0))
@@ -199,13 +199,13 @@ class StandingDrive(Drive):
 def plan_after(
     seconds: float, goal: Goal, *, body: BodyDescription = BODY, gap: float = 0.2
 ) -> LocalPlan:
-    """Return the plan of a body that has stood for some seconds with a gap before it."""
+    """Return the plan of a body that stands for `seconds` in front of an unseen gap."""
     drive = StandingDrive(body, goal, np.empty((0, 2)))
     drive.planner._ground = with_gap(gap)
     return drive.go(seconds)
 
 
-def test_a_body_that_gets_no_farther_turns_to_look_at_the_ground_on_its_way() -> None:
+def test_a_stuck_body_turns_to_look_at_the_ground_ahead() -> None:
     aside = Goal(x=0.5, y=0.5)
     assert plan_after(1.9, aside).reason != LOOKING
     plan = plan_after(2.3, aside)
@@ -221,7 +221,7 @@ def test_it_backs_off_from_ground_that_is_too_near_to_be_in_view() -> None:
 
 
 @pytest.mark.long
-def test_it_looks_for_a_few_seconds_and_only_at_what_was_not_seen() -> None:
+def test_it_looks_for_a_few_seconds_and_at_unseen_ground_only() -> None:
     assert plan_after(8.3, Goal(x=1.2, y=0.0)).reason != LOOKING
     assert plan_after(14.3, Goal(x=1.2, y=0.0)).reason == LOOKING  # and again
     assert plan_after(2.3, Goal(x=1.2, y=0.0), gap=0.0).reason != LOOKING
@@ -233,13 +233,13 @@ def test_a_body_larger_than_its_window_has_no_unseen_ground_beyond_it() -> None:
     assert not any(ground.is_unseen_ahead(HERE, turn, 0.15) for turn in np.linspace(-3, 3, 7))
 
 
-def test_who_goes_aside_need_not_look() -> None:
+def test_a_strafing_body_need_not_look() -> None:
     assert (
         plan_after(2.3, Goal(x=1.2, y=0.0), body=replace(OMNI, cameras=(FRONT,))).reason != LOOKING
     )
 
 
-def test_a_body_that_gets_no_farther_fills_the_gap_before_it() -> None:
+def test_a_stuck_body_fills_the_gap_ahead() -> None:
     drive = StandingDrive(BODY, Goal(x=1.2, y=0.0), np.empty((0, 2)))
     ground = drive.planner._ground = with_gap(0.1)
     unseen = int((ground._looked == 0).sum())

@@ -1,4 +1,4 @@
-"""Plans to goals: tight, clear of walls, steady; and what cannot be reached, with the reason."""
+"""Paths to goals: short, clear of walls, stable; and the reasons for unreachable goals."""
 
 import math
 
@@ -43,7 +43,7 @@ def rooms(door: int = 8) -> np.ndarray:
     return cells
 
 
-def test_in_the_open_the_path_is_the_straight_line() -> None:
+def test_without_obstacles_the_path_is_straight() -> None:
     found = path(seen(empty(10, 10)), (0.52, 0.53), (8.31, 3.77))
     straight = math.hypot(8.31 - 0.52, 3.77 - 0.53)
     assert tuple(found.points[0]) == (0.52, 0.53)
@@ -66,7 +66,7 @@ def test_the_path_leads_through_the_door_and_keeps_off_its_posts() -> None:
     assert gaps.min() > 0.3
 
 
-def test_pulling_tight_costs_no_more_than_the_cells_did() -> None:
+def test_a_smoothed_path_costs_no_more_than_its_cells() -> None:
     rng = np.random.default_rng(5)
     cells = np.where(rng.random((80, 80)) < 0.03, 100, 0)
     cells[:4, :4] = cells[-4:, -4:] = 0
@@ -80,7 +80,7 @@ def test_pulling_tight_costs_no_more_than_the_cells_did() -> None:
 
 
 @pytest.mark.parametrize(("door", "passes"), [(2, False), (3, True)])
-def test_a_door_lets_through_what_fits(door: int, passes: bool) -> None:
+def test_a_door_is_passed_if_the_body_fits(door: int, passes: bool) -> None:
     """It needs 0.15 m to each side, and the cells are 0.1 m."""
     found = GlobalPlanner().plan(seen(rooms(door)), (0.5, 2.5), (5.5, 2.5))
     assert isinstance(found, Path) is passes
@@ -95,7 +95,7 @@ def test_a_door_lets_through_what_fits(door: int, passes: bool) -> None:
         ((-0.25, 2.05), "the goal is outside the map"),
     ],
 )
-def test_a_goal_where_the_body_cannot_be_is_refused_with_the_nearest_place_where_it_can(
+def test_a_goal_where_the_body_does_not_fit_is_refused_with_the_nearest_place(
     goal: tuple[float, float], why: str
 ) -> None:
     found = refused(seen(rooms()), (0.55, 2.05), goal)
@@ -105,14 +105,14 @@ def test_a_goal_where_the_body_cannot_be_is_refused_with_the_nearest_place_where
     assert isinstance(GlobalPlanner().plan(seen(rooms()), (0.55, 2.05), found.nearest), Path)
 
 
-def test_the_refusal_says_it_in_words() -> None:
+def test_the_refusal_has_a_text() -> None:
     found = refused(seen(rooms()), (5.55, 2.05), (3.05, 2.05))
     assert found.reason == (
         "the goal is inside something; nearest reachable point is 0.20 m away at (2.85, 2.05)"
     )
 
 
-def test_without_a_way_the_nearest_point_is_the_one_on_this_side() -> None:
+def test_without_a_path_the_nearest_point_is_on_this_side() -> None:
     found = refused(seen(rooms(door=0)), (0.55, 1.05), (4.05, 1.05))
     assert found.reason == (
         "no way leads to the goal; nearest reachable point is 1.20 m away at (2.85, 1.05)"
@@ -121,7 +121,7 @@ def test_without_a_way_the_nearest_point_is_the_one_on_this_side() -> None:
 
 
 @pytest.mark.parametrize("wrong", [NAN, INF, -INF])
-def test_what_is_not_a_number_is_no_goal(wrong: float) -> None:
+def test_a_goal_that_is_not_a_number_is_refused(wrong: float) -> None:
     for start, goal in (
         ((1.0, 1.0), (wrong, 1.0)),
         ((1.0, 1.0), (1.0, wrong)),
@@ -135,7 +135,7 @@ def test_a_robot_outside_the_map_cannot_plan() -> None:
     assert refused(seen(rooms()), (-1.0, 1.0), (1.0, 1.0)).reason == "the robot is outside the map"
 
 
-def test_a_robot_that_is_walled_in_is_told_so() -> None:
+def test_an_enclosed_robot_gets_the_reason() -> None:
     cells = empty(3.0, 3.0)
     cells[14:17, 14:17] = 100
     cells[15, 15] = 0
@@ -171,11 +171,11 @@ def test_unknown_space_is_crossed_avoided_or_forbidden() -> None:
     assert path(seen(cells, "avoid"), start, inside).remaining[0] == pytest.approx(3.0)
     why = refused(seen(cells, "forbid"), start, inside).reason
     assert why.startswith("the goal is in unknown space, which is forbidden; nearest reachable")
-    out = path(seen(cells, "forbid"), inside, start)  # by the shortest way, then round
+    out = path(seen(cells, "forbid"), inside, start)  # by the shortest path out, then round
     assert 4.0 < out.remaining[0] < 5.5
 
 
-def test_avoided_unknown_space_is_crossed_where_nothing_else_leads() -> None:
+def test_avoided_unknown_space_is_crossed_if_there_is_no_other_path() -> None:
     cells = drawn("..???..", times=10)
     assert path(seen(cells, "avoid"), (0.5, 0.5), (6.5, 0.5)).remaining[0] == pytest.approx(6.0)
     assert refused(seen(cells, "forbid"), (0.5, 0.5), (6.5, 0.5)).nearest == pytest.approx(
@@ -183,7 +183,7 @@ def test_avoided_unknown_space_is_crossed_where_nothing_else_leads() -> None:
     )
 
 
-def test_a_path_is_valid_until_something_stands_on_it() -> None:
+def test_a_path_is_valid_until_an_obstacle_is_on_it() -> None:
     cells = rooms()
     found = path(seen(cells), (0.5, 2.5), (5.5, 2.5))
     assert is_valid(found, seen(cells))
@@ -204,14 +204,14 @@ def test_a_path_beyond_a_map_that_shrank_is_not_valid() -> None:
     assert not is_valid(found, seen(empty(3, 3)))
 
 
-def test_of_two_equal_ways_the_one_taken_is_kept() -> None:
+def test_of_two_equal_paths_the_present_one_is_kept() -> None:
     cells = empty(6.1, 6.1)
     cells[25:36, 25:36] = 100
     made, planner = seen(cells), GlobalPlanner()
     goal = (5.55, 3.05)
     right_round = path(made, (0.55, 3.05), goal)
     below = right_round.points[:, 1].min() < 2.5
-    cells[30, 36] = 0  # a change that matters to neither
+    cells[30, 36] = 0  # a change beside both paths
     for shift in (0.1, -0.1, 0.2, -0.2):
         again = planner.replan(seen(cells), (0.75, 3.05 + shift), goal, right_round)
         assert isinstance(again, Path)
@@ -219,7 +219,7 @@ def test_of_two_equal_ways_the_one_taken_is_kept() -> None:
         assert tuple(again.points[0]) == (0.75, 3.05 + shift)
 
 
-def test_a_much_better_way_is_taken_and_a_slightly_better_one_is_not() -> None:
+def test_the_robot_switches_to_a_much_better_path_only() -> None:
     cells = empty(6.1, 3.0)
     cells[:27, 30] = 100
     cells[0:5, 30] = 100
@@ -273,7 +273,7 @@ def test_a_kept_path_is_the_one_that_a_search_would_keep(seed: int) -> None:
         old = again
 
 
-def test_a_long_path_is_led_round_what_blocks_it_without_a_search_of_all(
+def test_a_blocked_long_path_gets_a_detour_without_a_full_search(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     cells, planner, goal = empty(100.0, 6.0), GlobalPlanner(), (99.5, 3.0)
@@ -300,7 +300,7 @@ def test_a_long_path_whose_corridor_is_closed_leads_elsewhere() -> None:
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_a_path_that_is_led_round_costs_little_more_than_the_cheapest(seed: int) -> None:
+def test_a_path_with_a_detour_costs_little_more_than_the_cheapest(seed: int) -> None:
     rng, planner, goal = np.random.default_rng(seed), GlobalPlanner(), (35.5, 35.5)
     cells = empty(36.0, 36.0)
     for row, column in rng.integers(20, 330, (60, 2)):
@@ -322,7 +322,7 @@ def test_a_path_that_is_led_round_costs_little_more_than_the_cheapest(seed: int)
     assert blocked >= 6
 
 
-def test_who_has_strayed_or_has_another_goal_gets_a_new_path() -> None:
+def test_a_robot_off_its_path_or_with_another_goal_gets_a_new_path() -> None:
     made = seen(empty(6, 6))
     old = path(made, (0.5, 0.5), (5.5, 0.5))
     assert remaining_path(old, made, (2.0, 1.2)) is None
@@ -334,7 +334,7 @@ def test_who_has_strayed_or_has_another_goal_gets_a_new_path() -> None:
     assert tuple(other.points[-1]) == (5.5, 5.5)
 
 
-def test_what_is_left_of_a_path_begins_where_the_robot_is() -> None:
+def test_the_rest_of_a_path_begins_at_the_robot() -> None:
     made = seen(empty(6, 6))
     rest = remaining_path(path(made, (0.5, 0.5), (5.5, 0.5)), made, (3.02, 0.6))
     assert rest is not None
@@ -342,18 +342,18 @@ def test_what_is_left_of_a_path_begins_where_the_robot_is() -> None:
     assert rest.remaining[0] == pytest.approx(2.5, abs=0.1)
 
 
-def test_a_plan_to_where_the_robot_is_ends_there() -> None:
+def test_a_path_to_the_robots_own_place_ends_there() -> None:
     found = path(seen(empty(3, 3)), (1.0, 1.0), (1.0, 1.0))
     assert found.remaining[0] == found.cost[0] == 0.0
 
 
-def test_the_same_question_has_the_same_answer() -> None:
+def test_the_same_request_has_the_same_path() -> None:
     made = seen(rooms())
     one, other = (path(made, (0.5, 2.5), (5.5, 2.5)) for _ in range(2))
     np.testing.assert_array_equal(one.points, other.points)
 
 
-def test_the_cost_to_go_falls_along_the_path_and_is_infinite_where_no_way_leads() -> None:
+def test_the_cost_to_go_falls_along_the_path_and_is_inf_if_unreachable() -> None:
     cells = rooms()
     cells[20:25, 50:55] = 100
     cells[22, 52] = 0

@@ -1,4 +1,4 @@
-"""Costs of plans under a limit: only a plan that costs at least the limit may be given up."""
+"""Costs of plans with a limit: only plans that reach the limit may be dropped."""
 
 import math
 
@@ -35,8 +35,8 @@ START = InitialState(
     0.0, 0.0, 0.2, 0.8, 0.0, 0.3, (0.8, 0.0, 0.3), np.tile((0.8, 0.0, 0.3), (3, 1)), 0.4,
     first_order_lag(0.15, DT), 1.0,
 )  # fmt: skip
-NOBODY = np.empty((0, 6))
-SOMEBODY = np.array([(1.2, 0.6, 0.0, -0.8, 0.3, 0.05), (1.0, -1.5, 0.5, 1.0, 0.3, 0.05)])
+NO_DISCS = np.empty((0, 6))
+DISCS = np.array([(1.2, 0.6, 0.0, -0.8, 0.3, 0.05), (1.0, -1.5, 0.5, 1.0, 0.3, 0.05)])
 
 
 @kernel
@@ -58,7 +58,7 @@ def prices(
 
 
 def scene(discs: Floats) -> Scene:
-    """Posts all over 8 x 8 m, some so near to one another that no body fits between."""
+    """Return posts in 8 x 8 m, some too close together for a body to pass."""
     random = np.random.default_rng(3)
     free = np.ones((320, 320), dtype=np.uint8)
     for x, y in random.uniform(-4.0, 4.0, (60, 2)):
@@ -84,10 +84,8 @@ def random_plans() -> Floats:
 
 
 @pytest.mark.long
-@pytest.mark.parametrize(("weights", "discs"), [(Weights(), NOBODY), (WEIGHTS, SOMEBODY)])
-def test_a_plan_is_given_up_only_where_it_costs_as_much_as_the_limit(
-    weights: Weights, discs: Floats
-) -> None:
+@pytest.mark.parametrize(("weights", "discs"), [(Weights(), NO_DISCS), (WEIGHTS, DISCS)])
+def test_a_cost_is_inf_only_if_it_reaches_the_limit(weights: Weights, discs: Floats) -> None:
     plans = random_plans()
     limits = np.array([math.inf, 40.0, 60.0, 100.0, 150.0])
     costs = np.empty((len(limits), BLOCKS, LANES))
@@ -118,8 +116,8 @@ def not_worth_pricing(
 
 @pytest.mark.long
 @pytest.mark.parametrize("goal", [(3.0, 0.0), (0.4, 0.1)])
-@pytest.mark.parametrize(("weights", "discs"), [(Weights(), NOBODY), (WEIGHTS, SOMEBODY)])
-def test_a_plan_is_dropped_by_its_end_only_where_it_costs_as_much_as_the_limit(
+@pytest.mark.parametrize(("weights", "discs"), [(Weights(), NO_DISCS), (WEIGHTS, DISCS)])
+def test_a_plan_is_dropped_by_its_end_only_if_it_reaches_the_limit(
     weights: Weights, discs: Floats, goal: tuple[float, float]
 ) -> None:
     plans, states = random_plans(), np.empty((STEPS + 1, STATE))

@@ -1,4 +1,4 @@
-"""Reeds-Shepp words: they end where they should, and none is longer than it need be."""
+"""Reeds-Shepp words: they end at their pose, and have the shortest length."""
 
 import math
 
@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from gigabrain_zenoh.navigation.reeds_shepp import SEGMENTS, along, best_word
 
 places, yaws = st.floats(-6.0, 6.0), st.floats(-math.pi, math.pi)
-FAIR = (1.0, 0.0)  # a metre in reverse costs as much as one forwards, a change of direction nothing
+FAIR = (1.0, 0.0)  # reversing costs no more than driving forwards, changing direction nothing
 
 
 def word(
@@ -53,7 +53,7 @@ def test_the_length_of_known_words(pose: tuple[float, float, float], length: flo
     assert word(*pose)[0] == pytest.approx(length)
 
 
-def test_where_reversing_is_dear_a_way_forwards_is_taken() -> None:
+def test_expensive_reversing_gives_a_forward_word() -> None:
     shortest, lengths, _ = word(1.0, 2.0, 3.0)
     assert min(lengths) < 0.0
     _, lengths, _ = word(1.0, 2.0, 3.0, (100.0, 100.0))

@@ -1,4 +1,4 @@
-"""Ways over a grid of costs: the cheapest there are, by another hand's Dijkstra."""
+"""Cheapest paths over a grid of costs, compared with a plain Dijkstra."""
 
 import math
 
@@ -12,7 +12,7 @@ OPEN = np.ones((9, 9), np.float32)
 
 
 def random_costs(seed: int, shape: tuple[int, int] = (31, 23)) -> np.ndarray:
-    """A third of the cells lethal, some of them more than others; the rest of any cost."""
+    """Return random costs; a third of the cells are lethal, to different degrees."""
     rng = np.random.default_rng(seed)
     cost = rng.uniform(1, 13, shape)
     lethal = rng.random(shape) < 0.3
@@ -46,7 +46,7 @@ def test_no_way_is_cheaper_on_random_grids(seed: int) -> None:
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_the_field_from_a_cell_is_what_dijkstra_finds(seed: int) -> None:
+def test_the_field_from_a_cell_equals_dijkstras(seed: int) -> None:
     cost = random_costs(seed)
     field = GridSearch().field(cost, (15, 11), "from")
     expected = np.full(cost.shape, np.inf)
@@ -55,7 +55,7 @@ def test_the_field_from_a_cell_is_what_dijkstra_finds(seed: int) -> None:
     np.testing.assert_allclose(field, expected, rtol=1e-9)
 
 
-def test_the_field_to_a_cell_is_what_the_way_from_each_costs() -> None:
+def test_the_field_to_a_cell_is_the_cost_of_the_path_from_each() -> None:
     cost, search = random_costs(3, (12, 10)), GridSearch()
     goal = (5, 5)
     cost[goal] = 1.0
@@ -66,7 +66,7 @@ def test_the_field_to_a_cell_is_what_the_way_from_each_costs() -> None:
             assert field[row, column] == pytest.approx(best, rel=1e-9)
 
 
-def test_in_the_open_the_way_is_straight_and_diagonal_steps() -> None:
+def test_a_free_path_has_straight_and_diagonal_steps() -> None:
     cells = GridSearch().path(OPEN, (0, 0), (2, 5))
     assert cells is not None
     assert spent(OPEN, cells) == pytest.approx(3 + 2 * 1.4142135623730951)
@@ -74,7 +74,7 @@ def test_in_the_open_the_way_is_straight_and_diagonal_steps() -> None:
 
 def test_corners_are_not_cut() -> None:
     cost = OPEN.copy()
-    cost[4, :4] = cost[5, 5:] = 200.0  # they touch at a corner, between (4, 3) and (5, 5)
+    cost[4, :4] = cost[5, 5:] = 200.0  # the walls touch at a corner, between (4, 3) and (5, 5)
     cells = GridSearch().path(cost, (3, 3), (5, 4))
     assert cells is not None
     assert spent(cost, cells) == 3.0  # one aside, two on: 1 + sqrt(2) would pass the corner
@@ -95,7 +95,7 @@ def test_a_door_of_one_cell_is_found() -> None:
     assert [4, 7] in cells.tolist()
 
 
-def test_who_stands_too_close_may_leave_but_nobody_may_enter() -> None:
+def test_lethal_cells_may_be_left_but_not_entered() -> None:
     cost = OPEN.copy()
     cost[:3] = np.array([200.0, 150.0, 120.0], np.float32)[:, np.newaxis]
     out = GridSearch().path(cost, (0, 4), (8, 4))
@@ -104,7 +104,7 @@ def test_who_stands_too_close_may_leave_but_nobody_may_enter() -> None:
     assert GridSearch().path(cost, (8, 4), (2, 4)) is None
 
 
-def test_nobody_leaves_through_what_is_closer_still() -> None:
+def test_lethal_cells_are_not_left_through_more_expensive_ones() -> None:
     cost = OPEN.copy()
     cost[3:6] = np.array([150.0, 180.0, 150.0], np.float32)[:, np.newaxis]
     cost[:3] = 200.0
@@ -112,7 +112,7 @@ def test_nobody_leaves_through_what_is_closer_still() -> None:
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_a_path_is_never_thought_dearer_than_it_is_however_costs_change(seed: int) -> None:
+def test_bounds_never_exceed_the_cost_of_a_path_when_costs_change(seed: int) -> None:
     cost, rng, search = random_costs(seed, (60, 50)), np.random.default_rng(seed), GridSearch()
     for _ in range(30):
         row, column = (int(value) for value in rng.integers(0, 45, 2))
@@ -135,13 +135,13 @@ def test_the_same_memory_serves_many_searches_and_sizes() -> None:
             assert len(cells) == size
 
 
-def test_a_way_to_where_it_begins_is_one_cell() -> None:
+def test_a_path_to_its_own_start_is_one_cell() -> None:
     cells = GridSearch().path(OPEN, (4, 4), (4, 4))
     assert cells is not None
     assert cells.tolist() == [[4, 4]]
 
 
-def test_a_grid_that_needs_more_room_than_thought_gets_it() -> None:
+def test_the_entries_grow_when_they_run_out() -> None:
     cost, search = random_costs(7, (60, 60)), GridSearch()
     search.path(cost, (0, 0), (59, 59))
     search._memory = search._memory._replace(entries=np.empty((3, 16), np.int32))
@@ -151,7 +151,7 @@ def test_a_grid_that_needs_more_room_than_thought_gets_it() -> None:
 
 
 @pytest.mark.slow
-def test_marks_of_months_of_searches_are_reset_in_time() -> None:
+def test_marks_are_reset_before_they_overflow() -> None:
     search, cost = GridSearch(), np.ones((20, 30))
     expected = search.path(cost, (1, 1), (15, 22))
     search._run_number = np.iinfo(np.int32).max // 32 - 3  # 6.7e7 searches later

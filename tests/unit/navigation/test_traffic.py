@@ -1,4 +1,4 @@
-"""The traffic map: ways that avoid quick things are preferred, if they are not much longer."""
+"""The traffic map: paths that avoid quick obstacles are preferred if not much longer."""
 
 import math
 from typing import Any
@@ -25,8 +25,8 @@ from gigabrain_zenoh.navigation.warm_up import warm_up_local_planner
 from gigabrain_zenoh.qa.bench.barn import drive_functions
 from gigabrain_zenoh.qa.bench.barn_course import HARD, JACKAL, BarnWorld, MovingDisc
 
-NOTHING = np.empty((0, 2))
-NOBODY = np.empty((0, 6))
+NO_POINTS = np.empty((0, 2))
+NO_DISCS = np.empty((0, 6))
 GOAL = (12.0, 0.0)
 
 
@@ -43,15 +43,15 @@ def crossing(seconds: float, speed: float) -> TrafficMap:
     return traffic
 
 
-def test_where_nothing_quick_was_seen_ways_cost_what_they_are_long() -> None:
+def test_without_quick_discs_there_is_no_traffic() -> None:
     traffic = TrafficMap(0.4, 2.0, 10.0)
-    traffic.update(1, 0.0, 0.0, NOBODY)
-    traffic.update(3, 0.0, 0.0, NOBODY)
+    traffic.update(1, 0.0, 0.0, NO_DISCS)
+    traffic.update(3, 0.0, 0.0, NO_DISCS)
     assert traffic.ways(GOAL) is None
 
 
 @pytest.mark.long
-def test_what_is_compiled_before_it_drives_is_all_that_it_will_call() -> None:
+def test_warm_up_compiles_all_kernels_of_a_drive() -> None:
     warm_up_local_planner(ANY_BODY)
     kernels: list[Any] = [dynamic_obstacles._add_watched, dynamic_obstacles._add_passing]
     kernels += [cost_to_go._scale_costs, cost_to_go._seed_rim]
@@ -61,7 +61,7 @@ def test_what_is_compiled_before_it_drives_is_all_that_it_will_call() -> None:
     assert 0 not in before
 
 
-def test_a_metre_where_quick_things_pass_costs_more_than_one_beside() -> None:
+def test_a_metre_in_traffic_costs_more_than_one_beside_it() -> None:
     ways = crossing(2.0, 1.7).ways(GOAL)
     assert ways is not None
     there, beside = (distance_at(ways.price, *at) for at in ((5.0, 0.0), (5.0, -9.0)))
@@ -71,7 +71,7 @@ def test_a_metre_where_quick_things_pass_costs_more_than_one_beside() -> None:
     assert distance_at(ways.field, 8.5, 0.0) == pytest.approx(3.5, abs=0.4)
 
 
-def test_what_is_faster_costs_more_and_what_can_be_dodged_nothing() -> None:
+def test_faster_discs_cost_more_and_slow_ones_nothing() -> None:
     dear, cheap = crossing(2.0, 1.8).ways(GOAL), crossing(2.0, 1.55).ways(GOAL)
     assert dear
     assert cheap
@@ -85,7 +85,7 @@ def test_it_fades_and_is_forgotten() -> None:
     dearest = [price_of(traffic)]
     for minute in range(5):
         for tick in range(51 + 3000 * minute, 51 + 3000 * (minute + 1), UPDATE_TICKS):
-            traffic.update(tick, 0.0, 0.0, NOBODY)
+            traffic.update(tick, 0.0, 0.0, NO_DISCS)
             traffic.ways(GOAL)
         dearest.append(price_of(traffic))
     assert dearest[0] > 4.0
@@ -99,11 +99,11 @@ def price_of(traffic: TrafficMap) -> float:
 
 
 @pytest.mark.parametrize("to", [(9.0, 0.0), (-8.0, 7.0), (500.0, 0.0)])
-def test_it_stays_where_it_was_when_the_robot_goes_on(to: tuple[float, float]) -> None:
+def test_the_traffic_keeps_its_place_when_the_robot_moves(to: tuple[float, float]) -> None:
     traffic = crossing(2.0, 1.7)
     before = traffic.ways(GOAL)
     for tick in range(101, 105 + UPDATE_TICKS, 2):
-        traffic.update(tick, *to, NOBODY)
+        traffic.update(tick, *to, NO_DISCS)
     after = traffic.ways(GOAL)
     assert before
     if to[0] > 100.0:
@@ -116,10 +116,10 @@ def test_it_stays_where_it_was_when_the_robot_goes_on(to: tuple[float, float]) -
         )
 
 
-def test_the_local_field_leads_round_what_it_cannot_see_the_end_of() -> None:
+def test_the_local_field_leads_round_traffic_beyond_the_window() -> None:
     window = LocalCostmap(8.0, 10.0)
-    window.add_scan(1, Pose2D(0.0, 0.0, 0.0), (0.0, 0.0), NOTHING)
-    grid, costs = window.grid(1, NOTHING, NOBODY), CostToGo(window.cells)
+    window.add_scan(1, Pose2D(0.0, 0.0, 0.0), (0.0, 0.0), NO_POINTS)
+    grid, costs = window.grid(1, NO_POINTS, NO_DISCS), CostToGo(window.cells)
     traffic = crossing(2.0, 1.7)
     plain = costs.field(grid, 0.2, GOAL, None)
     ahead, aside = ((3.0, 0.0), (2.0, -3.5))
@@ -129,7 +129,7 @@ def test_the_local_field_leads_round_what_it_cannot_see_the_end_of() -> None:
 
 
 def looks(discs: tuple[Obstacle, ...], seconds: float) -> LocalPlan:
-    """Return the plan of a Jackal `seconds` after it was given a goal."""
+    """Return the plan of a Jackal `seconds` after it gets a goal."""
     planner = LocalPlanner(JACKAL, LocalSettings(samples=128, window=6.0))
     for tick in (1, 1 + round(seconds / 0.02)):
         request = PlanRequest(
@@ -137,14 +137,14 @@ def looks(discs: tuple[Obstacle, ...], seconds: float) -> LocalPlan:
             pose=Pose(x=0.0, y=0.0, yaw=0.0),
             velocity=Velocity(),
             goal=Goal(x=12.0, y=0.0),
-            hits=NOTHING,
+            hits=NO_POINTS,
             obstacles=discs,
         )
         plan = planner.plan(request)
     return plan
 
 
-def test_where_things_move_it_looks_longer_and_makes_way_for_what_comes() -> None:
+def test_in_traffic_it_looks_longer_and_makes_way() -> None:
     far = Obstacle(id=1, x=6.0, y=0.0, velocity_y=1.5, radius=0.5)
     coming = Obstacle(id=2, x=3.0, y=0.0, velocity_x=-1.5, radius=0.5)
     wait = "waiting: it looks round for what moves"
@@ -157,7 +157,7 @@ def test_where_things_move_it_looks_longer_and_makes_way_for_what_comes() -> Non
 
 
 def crowd() -> BarnWorld:
-    """Ten discs that go to and fro between a Jackal and its goal."""
+    """Ten discs that move back and forth between a Jackal and its goal."""
     rows = [3.0 + 1.5 * i for i in range(5)]
     times = np.array([0.0, 4.0, 8.0])
     movers = tuple(

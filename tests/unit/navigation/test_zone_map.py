@@ -37,7 +37,7 @@ def costs_with(*zones: Zone, size: float = 10.0) -> "tuple[np.ndarray, np.ndarra
     return zoned.cost, zoned.against
 
 
-def test_cells_nearer_to_a_zone_than_the_body_needs_are_lethal_and_no_more_than_that() -> None:
+def test_cells_too_close_to_a_zone_are_lethal_but_not_more() -> None:
     cost, _ = costs_with(keepout(*SQUARE))
     rows, columns = np.mgrid[:100, :100]
     centres = np.column_stack((columns.ravel(), rows.ravel())) * 0.1 + 0.05
@@ -117,13 +117,15 @@ def test_crossing_edges_are_found_as_by_comparing_all_pairs(
         (((1e5, 1e5), (1e5 - 1, 1e5), (1e5, 1e5 - 1)), ""),
     ],
 )
-def test_only_simple_polygons_will_do(points: tuple[tuple[float, float], ...], why: str) -> None:
+def test_only_simple_polygons_are_accepted(
+    points: tuple[tuple[float, float], ...], why: str
+) -> None:
     assert polygon.problem(np.array(points, float)) == why
 
 
 @pytest.mark.parametrize("heading", np.linspace(-math.pi, math.pi, 33))
 def test_no_mix_of_allowed_ways_goes_back_along_a_lane(heading: float) -> None:
-    """So a zigzag cannot do what no way may: the allowed ways that lead back are on one side."""
+    """A zigzag cannot lead back: the allowed ways that lead back are all on one side."""
     ahead = np.array((math.cos(heading), math.sin(heading)))
     _, against = costs_with(lane((5 - 3 * ahead[0], 5 - 3 * ahead[1]), (5 + 3 * ahead[0],
                                  5 + 3 * ahead[1]), width=2.0))  # fmt: skip
@@ -135,7 +137,7 @@ def test_no_mix_of_allowed_ways_goes_back_along_a_lane(heading: float) -> None:
     back = [step for step in allowed if step @ ahead < -1e-9]
     for one in back:
         for other in allowed:
-            if (one @ aside) * (other @ aside) < 0:  # together they lead nowhere aside
+            if (one @ aside) * (other @ aside) < 0:  # sideways they cancel
                 share = abs(one @ aside) / abs(other @ aside)
                 assert (one + share * other) @ ahead > -1e-6
 
@@ -165,7 +167,7 @@ def test_paths_lead_along_lanes_and_past_them_but_not_against_them() -> None:
     assert isinstance(planner.plan(shut, (9.0, 5.0), (1.0, 5.0)), Unreachable)
 
 
-def test_the_allowed_speed_falls_to_that_of_the_zone_before_the_body_is_there() -> None:
+def test_the_allowed_speed_falls_before_the_body_reaches_the_zone() -> None:
     zones = ZoneMap([Zone(name="ramp", kind="speed", max_speed=0.2,
                           points=((3.0, -1.0), (5.0, -1.0), (5.0, 1.0), (3.0, 1.0)))])  # fmt: skip
     footprint = ((0.2, 0.2), (-0.2, 0.2), (-0.2, -0.2), (0.2, -0.2))
@@ -183,7 +185,7 @@ def test_the_allowed_speed_falls_to_that_of_the_zone_before_the_body_is_there() 
     assert allowed(5.3, 0.2) == math.inf
 
 
-def test_a_body_in_a_zone_may_leave_it_and_come_no_farther_in() -> None:
+def test_a_body_in_a_zone_may_leave_it_but_not_go_deeper() -> None:
     window = LocalCostmap(6.0, 10.0)
     nothing = np.empty((0, 2))
     window.add_scan(1, Pose2D(0.0, 0.0, 0.0), (0.0, 0.0), nothing)
@@ -195,7 +197,7 @@ def test_a_body_in_a_zone_may_leave_it_and_come_no_farther_in() -> None:
     def near(x: float, y: float) -> float:
         return float(grid.distance[int((y - grid.y) / grid.cell), int((x - grid.x) / grid.cell)])
 
-    assert near(-0.8, 0.0) > 0.0  # where it is
+    assert near(-0.8, 0.0) > 0.0  # at its place
     assert near(-1.5, 0.0) > 0.0  # on its way out
     assert near(0.5, 0.0) == 0.0
     assert near(2.2, 2.2) == 0.0  # another zone is closed up to its rim
