@@ -34,7 +34,7 @@ WIDE_WINDOW = Window(1.0, 0.6)  # searched if the scan fits nowhere near the gue
 WIDE_POINTS = 45  # of a scan, for a wide search; few, as ICP and the view confirm it
 CLEAR_SCORE = 0.85  # better matches are not doubted
 MAX_SEEN_THROUGH = 0.2  # share of the map's points in view; more of them contradict the pose
-MIN_SEEN_LESS = 0.1  # of that share, for a wide search
+MIN_SEEN_DECREASE = 0.1  # of that share, by a wide search
 MIN_SCORE_GAIN = 0.1  # for a place that odometry does not lead to
 MAX_OFF_GUESS_M = 0.3  # a match farther from the guess may have slid over known area
 MIN_INLIER_RATIO = 0.5  # of the match at the guess to one that may have slid
@@ -86,7 +86,7 @@ class DriftSinceMatch:
         return DriftSinceMatch(self.misses, travel, turn, self.blind or blind)
 
     def missed(self, fits_last: bool) -> "DriftSinceMatch":
-        """Return the state after an unmatched scan; does it fit the unmatched scan before?"""
+        """Return the state after an unmatched scan; `fits_last`: it fits the last unmatched one."""
         return replace(self, misses=self.misses + 1 if fits_last else 1)
 
     @property
@@ -301,7 +301,7 @@ class FrontEnd:
         fit = _fit(local, scan, found.pose, found.pose, prior)
         if fit.inliers < MIN_WIDE_INLIERS or _distance(fit.pose, found.pose) > MAX_SLIDE_M:
             return None
-        if seen_through(local.buckets.points, scan.points, fit.pose) > through - MIN_SEEN_LESS:
+        if seen_through(local.buckets.points, scan.points, fit.pose) > through - MIN_SEEN_DECREASE:
             return None
         return _icp_match(fit, found, prior, "recovered")
 
