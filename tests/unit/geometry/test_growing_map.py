@@ -1,4 +1,4 @@
-"""A map that grows: it closes its loop, survives a kidnapping, and goes on after it was saved."""
+"""A growing map closes loops, survives a kidnapped robot, and continues after it was saved."""
 
 import numpy as np
 import pytest
@@ -28,7 +28,7 @@ def toured() -> tuple[SlamMap, Walker]:
 
 
 @pytest.mark.long
-def test_after_a_tour_it_knows_where_it_is_and_has_drawn_the_house(
+def test_after_a_tour_the_robot_is_localized_and_the_house_is_mapped(
     toured: tuple[SlamMap, Walker],
 ) -> None:
     chart, walker = toured
@@ -59,7 +59,7 @@ def test_where_people_walked_the_map_is_free() -> None:
 
 
 @pytest.mark.long
-def test_carried_off_it_is_lost_and_found_and_the_map_is_not_spoilt() -> None:
+def test_a_robot_that_is_carried_away_is_relocalized_and_the_map_stays_intact() -> None:
     chart, walker = grown(Rooms(HOUSE), START, *ROUND)
     before = chart.to_save()[0]
     walker.pose = at(6.0, 4.5, 100)
@@ -78,7 +78,7 @@ def test_carried_off_it_is_lost_and_found_and_the_map_is_not_spoilt() -> None:
 
 
 @pytest.mark.long
-def test_lifted_without_a_sign_in_the_odometry_it_notices_after_3_scans() -> None:
+def test_a_move_that_odometry_misses_is_detected_after_3_scans() -> None:
     chart, walker = grown(Rooms(HOUSE), START, *ROUND)
     before = chart.to_save()[0]
     walker.pose = at(6.0, 4.5, 100)
@@ -92,7 +92,7 @@ def test_lifted_without_a_sign_in_the_odometry_it_notices_after_3_scans() -> Non
 
 
 @pytest.mark.long
-def test_what_was_saved_goes_on(toured: tuple[SlamMap, Walker]) -> None:
+def test_a_saved_map_can_be_continued(toured: tuple[SlamMap, Walker]) -> None:
     chart, walker = toured
     _, arrays = chart.to_save()
     again = Walker(Rooms(HOUSE, seed=3), SlamMap.thaw(arrays, PATIENCE_S), walker.pose)
@@ -104,7 +104,7 @@ def test_what_was_saved_goes_on(toured: tuple[SlamMap, Walker]) -> None:
     assert error(place, in_map(again)) < 0.05
 
 
-def test_what_was_kept_goes_on_at_the_next_scan(toured: tuple[SlamMap, Walker]) -> None:
+def test_a_kept_map_continues_at_the_next_scan(toured: tuple[SlamMap, Walker]) -> None:
     chart, walker = toured
     still = chart.still()
     assert still.pose is not None
@@ -116,7 +116,9 @@ def test_what_was_kept_goes_on_at_the_next_scan(toured: tuple[SlamMap, Walker]) 
 
 
 @pytest.mark.long
-def test_carried_off_before_it_goes_on_it_is_looked_for(toured: tuple[SlamMap, Walker]) -> None:
+def test_a_robot_that_was_carried_away_before_a_restart_is_searched_for(
+    toured: tuple[SlamMap, Walker],
+) -> None:
     chart, _ = toured
     still = chart.still()
     chart = SlamMap.thaw(still.freeze(), PATIENCE_S, last=still.pose)
@@ -128,9 +130,7 @@ def test_carried_off_before_it_goes_on_it_is_looked_for(toured: tuple[SlamMap, W
 
 
 @pytest.mark.parametrize("missing", ["poses", "sweep_hits", "link_ends"])
-def test_arrays_that_do_not_belong_together_are_refused(
-    missing: str, toured: tuple[SlamMap, Walker]
-) -> None:
+def test_inconsistent_arrays_are_refused(missing: str, toured: tuple[SlamMap, Walker]) -> None:
     arrays = dict(toured[0].to_save()[1])
     short = {**arrays, missing: arrays[missing][:-1]}
     for bad in (short, {name: values for name, values in arrays.items() if name != missing}):
@@ -139,10 +139,10 @@ def test_arrays_that_do_not_belong_together_are_refused(
 
 
 @pytest.mark.parametrize("name", ["points", "sweep_hits", "sweep_free", "sweep_sensor"])
-def test_points_that_no_lidar_has_seen_are_refused(
+def test_points_out_of_every_lidars_range_are_refused(
     name: str, toured: tuple[SlamMap, Walker]
 ) -> None:
-    """A beam of 1e9 m would be drawn for minutes."""
+    """Drawing a beam of 1e9 m would take minutes."""
     arrays = dict(toured[0].to_save()[1])
     far = arrays[name].copy()
     far[0] = 1e9
@@ -156,7 +156,7 @@ def test_the_same_drive_gives_the_same_map_bit_for_bit() -> None:
     assert np.array_equal(maps[0].cells, maps[1].cells)
 
 
-def test_work_beside_counts_at_the_scan_that_was_fixed_for_it() -> None:
+def test_background_work_is_applied_at_its_scheduled_scan() -> None:
     background, taken = ScheduledWorker(PATIENCE_S), []
     background.start(lambda: lambda: taken.append("now"), 3)
     for scan in range(1, 5):
@@ -166,7 +166,7 @@ def test_work_beside_counts_at_the_scan_that_was_fixed_for_it() -> None:
     background.close()
 
 
-def test_work_that_failed_is_raised_at_its_scan() -> None:
+def test_an_error_of_background_work_is_raised_at_its_scan() -> None:
     background = ScheduledWorker(PATIENCE_S)
 
     def fail() -> None:
@@ -179,8 +179,8 @@ def test_work_that_failed_is_raised_at_its_scan() -> None:
 
 
 @pytest.mark.slow
-def test_who_crowds_the_robot_does_not_put_it_at_the_other_end_of_a_hall() -> None:
-    """In a hall that is the same from both ends, odometry alone says which of them it is."""
+def test_people_around_the_robot_do_not_move_it_to_the_other_end_of_a_hall() -> None:
+    """In a hall that looks the same from both ends, only odometry tells them apart."""
     rooms = Rooms(HALL)
     chart, walker = grown(rooms, (3.0, 3.0), *HALL_ROUND)
     assert error(walker.look(), between(at(3.0, 3.0), walker.pose)) < 0.1
@@ -197,7 +197,7 @@ def test_who_crowds_the_robot_does_not_put_it_at_the_other_end_of_a_hall() -> No
 
 
 @pytest.mark.slow
-def test_bumped_askew_it_is_found_where_it_was_though_the_hall_has_another_such_place() -> None:
+def test_a_bumped_robot_is_found_nearby_although_the_hall_has_a_similar_place() -> None:
     _, walker = grown(Rooms(HALL), (3.0, 3.0), *HALL_ROUND)
     walker.go((11.0, 3.2))
     walker.pose = compose(walker.pose, at(0.3, 0.1, 35))

@@ -1,4 +1,4 @@
-"""Joints move smoothly: to a posture, onto a path, and at a speed that ends in time."""
+"""Joints move smoothly to a posture, onto a path, and at a speed until their range ends."""
 
 import itertools
 import math
@@ -25,7 +25,7 @@ DT = 0.02
 ELBOW = JointDescription(name="elbow", lower=-2.0, upper=2.0, max_speed=3.0, max_acceleration=20.0)
 tiny = st.builds(lambda sign, power: sign * 10.0**power, st.sampled_from((-1.0, 0.0, 1.0)),
                  st.floats(-19.0, -3.0))  # fmt: skip
-STEP_CHANGE = 20.0 * DT * 1.03  # [rad/s], of speed in a step
+MAX_SPEED_CHANGE = 20.0 * DT * 1.03  # [rad/s], per step
 
 
 def moved(goal: JointGoal, steps: int, start: float = 0.0) -> list[JointPoint]:
@@ -41,10 +41,10 @@ def test_a_posture_is_reached_within_the_limits_and_without_overshoot() -> None:
     assert max(point.position for point in points) <= 1.0 + 1e-6
     speeds = [point.velocity for point in points]
     assert 2.5 < max(speeds) <= 3.0
-    assert max(abs(b - a) for a, b in itertools.pairwise(speeds)) <= STEP_CHANGE
+    assert max(abs(b - a) for a, b in itertools.pairwise(speeds)) <= MAX_SPEED_CHANGE
 
 
-def test_a_lower_speed_can_be_asked_for() -> None:
+def test_a_lower_speed_can_be_requested() -> None:
     points = moved(JointGoal(1.0, max_speed=0.5), 30)
     assert max(point.velocity for point in points) == pytest.approx(0.5)
 
@@ -79,13 +79,13 @@ def test_a_joint_gets_onto_a_moving_path_and_stays_on_it() -> None:
     for step in range(60):
         path = [[0.8 * math.sin(math.pi * DT * (step + k))] for k in range(3)]
         new = along([point], path, [ELBOW], DT)[0]
-        assert abs(new.velocity - point.velocity) <= STEP_CHANGE
+        assert abs(new.velocity - point.velocity) <= MAX_SPEED_CHANGE
         point = new
         off.append(abs(point.position - path[1][0]))
     assert max(off[20:]) < 1e-9
 
 
-def test_a_joint_that_is_behind_does_not_run_past_the_end_of_a_path_that_brakes() -> None:
+def test_a_joint_that_is_behind_does_not_overshoot_the_end_of_a_braking_path() -> None:
     braking = 0.5 * ELBOW.max_acceleration
     point, end_s = JointPoint(-0.15, 1.5), 1.5 / braking
     for step in range(40):
@@ -105,7 +105,7 @@ def test_a_path_that_is_too_fast_is_followed_as_fast_as_the_joint_can() -> None:
     assert point.position > -0.5
 
 
-def test_without_ruckig_one_line_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_ruckig_the_error_names_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "ruckig", None)
     with pytest.raises(ConfigError, match=r"needs ruckig; pip install 'gigabrain-zenoh\[arm\]'"):
         ramp([JointPoint(0.0)], [REST], [ELBOW], DT)
@@ -113,21 +113,21 @@ def test_without_ruckig_one_line_says_what_to_install(monkeypatch: pytest.Monkey
         prepare(31)
 
 
-def test_joints_that_rest_but_for_rounding_are_held() -> None:
-    """Ruckig found no way from such speeds and accelerations, at which a robot had arrived."""
+def test_joints_at_rest_except_for_rounding_are_held() -> None:
+    """Ruckig found no motion from these speeds and accelerations, which occurred on a robot."""
     places = (-0.5943974399396441, -0.2666303726565727, 0.08470855106320617, 0.3707360604093174)
     speeds = (0.0, 6.23416249179165e-19, -7.589415207398531e-19, 1.301042606982605e-18)
-    pulls = (0.0, -1.165734175856414e-15, -1.332267629550188e-15, -1.110223024625157e-15)
-    now = [JointPoint(*point) for point in zip(places, speeds, pulls, strict=True)]
+    accelerations = (0.0, -1.165734175856414e-15, -1.332267629550188e-15, -1.110223024625157e-15)
+    now = [JointPoint(*point) for point in zip(places, speeds, accelerations, strict=True)]
     found = ramp(now, [JointGoal(place) for place in places], [ELBOW] * 4, DT)
     assert [point.position for point in found] == pytest.approx(places, abs=1e-9)
 
 
 @given(st.lists(st.tuples(tiny, tiny, tiny), min_size=6, max_size=6))
-def test_a_way_is_found_however_small_speeds_and_ways_are(
+def test_a_motion_is_found_for_tiny_speeds_and_distances(
     joints: list[tuple[float, float, float]],
 ) -> None:
-    now = [JointPoint(0.5, speed, pull) for speed, pull, _ in joints]
+    now = [JointPoint(0.5, speed, acceleration) for speed, acceleration, _ in joints]
     goals = [JointGoal(0.5 + way) for _, _, way in joints]
     found = ramp(now, goals, [ELBOW] * len(joints), DT)
     assert [point.position for point in found] == pytest.approx([0.5] * len(joints), abs=0.01)
@@ -135,14 +135,14 @@ def test_a_way_is_found_however_small_speeds_and_ways_are(
     along(now, path, [ELBOW] * len(joints), DT)
 
 
-def test_where_ruckig_finds_no_way_at_all_the_joints_brake(
+def test_joints_brake_if_ruckig_finds_no_motion(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    class NoWay:
+    class NoMotion:
         def calculate(self, given: object, path: object) -> None:
             raise ruckig.RuckigError("no way")
 
-    monkeypatch.setattr(joint_ramp, "_solver", lambda joints: NoWay())
+    monkeypatch.setattr(joint_ramp, "_solver", lambda joints: NoMotion())
     (point,) = ramp([JointPoint(0.0, 1.0)], [JointGoal(1.0)], [ELBOW], DT)
     assert point.velocity == pytest.approx(1.0 - 20.0 * DT)
     assert point.position == pytest.approx(0.6 * DT)

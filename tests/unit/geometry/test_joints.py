@@ -1,4 +1,4 @@
-"""Joints move within their speed, acceleration and range, and come to rest where they should."""
+"""Joints move within their speed, acceleration and range, and stop at their targets."""
 
 import itertools
 import math
@@ -22,7 +22,7 @@ from gigabrain_zenoh.geometry.joints import (
 
 DT = 0.02
 JOINT = JointDescription(name="elbow", lower=-1.5, upper=1.5, max_speed=3.0, max_acceleration=20.0)
-LATE = replace(JOINT, gains=JointGains(feed_forward=0.08))  # a servo that follows so late [s]
+LATE = replace(JOINT, gains=JointGains(feed_forward=0.08))  # a servo with this time constant [s]
 positions = st.floats(-1.5, 1.5)
 speeds = st.floats(-100.0, 100.0)
 
@@ -50,7 +50,7 @@ def test_a_far_target_is_reached_within_all_limits_and_not_overshot(
 
 
 @given(positions, st.lists(st.tuples(st.floats(-5, 5), speeds), min_size=1, max_size=200))
-def test_no_command_gets_a_joint_out_of_its_range(
+def test_no_command_moves_a_joint_out_of_its_range(
     start: float, targets: list[tuple[float, float]]
 ) -> None:
     now = JointMotion(start)
@@ -71,7 +71,7 @@ def test_a_braked_joint_comes_to_rest_within_its_range(start: float, velocity: f
     assert JOINT.lower <= now.position <= JOINT.upper
 
 
-def test_a_braked_joint_takes_back_most_of_what_its_servo_lags_behind() -> None:
+def test_a_braked_joint_takes_back_most_of_its_servos_lag() -> None:
     now = before = JointMotion(0.5, 1.0, lag=LATE.gains.feed_forward)
     for _ in range(2):
         now = braked(now, LATE, DT)
@@ -96,7 +96,7 @@ def test_a_joint_outside_its_range_moves_inwards_only() -> None:
     assert accelerated(now, -1.0, JOINT, DT).position < 1.7
 
 
-def test_rest_is_judged_by_all_joints_and_nan_is_no_rest() -> None:
+def test_joints_are_at_rest_only_if_all_are_and_none_is_nan() -> None:
     still, moving = JointMotion(1.0, 0.01), JointMotion(0.0, 0.2)
     assert joints_at_rest([still])
     assert not joints_at_rest([still, moving])
@@ -104,7 +104,7 @@ def test_rest_is_judged_by_all_joints_and_nan_is_no_rest() -> None:
     assert frozen(moving) == JointMotion(0.0)
 
 
-def test_a_joint_that_stops_takes_back_most_of_what_its_servo_lags_behind() -> None:
+def test_a_stopped_joint_takes_back_most_of_its_servos_lag() -> None:
     late, prompt = JointMotion(-1.0), JointMotion(-1.0)
     for _ in range(40):
         late, prompt = accelerated(late, 2.0, LATE, DT), accelerated(prompt, 2.0, JOINT, DT)
@@ -116,7 +116,7 @@ def test_a_joint_that_stops_takes_back_most_of_what_its_servo_lags_behind() -> N
 
 @pytest.mark.parametrize("stop", [lambda now: stopped(now), lambda now: braked(now, LATE, DT)])
 @given(speed=st.floats(-3.0, 3.0), ticks=st.integers(1, 12))
-def test_a_joint_that_has_just_set_off_is_not_sent_back_behind_its_start(
+def test_a_joint_that_has_just_started_is_not_sent_back_behind_its_start(
     stop: Callable[[JointMotion], JointMotion], speed: float, ticks: int
 ) -> None:
     now = JointMotion(0.0)

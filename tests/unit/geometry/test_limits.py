@@ -73,14 +73,14 @@ def test_a_wheel_may_be_far_over_its_limit() -> None:
     )
 
 
-def test_what_is_within_the_limits_passes_unchanged() -> None:
+def test_a_velocity_within_the_limits_is_unchanged() -> None:
     for sign in (1, -1):
         velocity = Velocity(linear_x=0.5 * sign, linear_y=0.25 * sign, angular_z=2.0 * sign)
         assert clamp(velocity, LIMITS) == velocity
 
 
 @pytest.mark.parametrize("sign", [1, -1])
-def test_what_is_beyond_them_is_cut_axis_by_axis(sign: int) -> None:
+def test_a_velocity_beyond_the_limits_is_cut_axis_by_axis(sign: int) -> None:
     asked = Velocity(linear_x=0.51 * sign, linear_y=0.26 * sign, angular_z=2.1 * sign)
     cut = Velocity(linear_x=0.5 * sign, linear_y=0.25 * sign, angular_z=2.0 * sign)
     assert clamp(asked, LIMITS) == cut
@@ -98,7 +98,7 @@ def test_a_base_whose_wheel_would_be_too_fast_is_slower_along_the_same_curve(sig
 
 
 @pytest.mark.parametrize(
-    ("caps", "most", "least"),
+    ("caps", "highest", "lowest"),
     [
         (SpeedCaps(forward=0.1), (0.1, 0.25, 2.0), (-0.5, -0.25, -2.0)),
         (SpeedCaps(backward=0.1), (0.5, 0.25, 2.0), (-0.1, -0.25, -2.0)),
@@ -111,16 +111,16 @@ def test_a_base_whose_wheel_would_be_too_fast_is_slower_along_the_same_curve(sig
         (SpeedCaps(forward=0.0, rotation=0.0), (0.0, 0.25, 0.0), (-0.5, -0.25, 0.0)),
     ],
 )
-def test_a_cap_holds_in_its_own_direction(
-    caps: SpeedCaps, most: tuple[float, float, float], least: tuple[float, float, float]
+def test_a_cap_limits_only_its_own_direction(
+    caps: SpeedCaps, highest: tuple[float, float, float], lowest: tuple[float, float, float]
 ) -> None:
     fast = Velocity(linear_x=9.0, linear_y=9.0, angular_z=9.0)
     back = Velocity(linear_x=-9.0, linear_y=-9.0, angular_z=-9.0)
     assert clamp(fast, LIMITS, caps) == Velocity(
-        linear_x=most[0], linear_y=most[1], angular_z=most[2]
+        linear_x=highest[0], linear_y=highest[1], angular_z=highest[2]
     )
     assert clamp(back, LIMITS, caps) == Velocity(
-        linear_x=least[0], linear_y=least[1], angular_z=least[2]
+        linear_x=lowest[0], linear_y=lowest[1], angular_z=lowest[2]
     )
 
 
@@ -143,11 +143,11 @@ def test_a_cap_above_the_bodys_own_limit_changes_nothing() -> None:
         (-0.5, 0.0, -0.25),
         (0.5, 0.375, 0.375),
         (-0.5, -0.375, -0.375),
-        (0.0, 0.0625, 0.0625),  # no further than the target
+        (0.0, 0.0625, 0.0625),  # no farther than the target
         (0.375, 0.375, 0.375),
         (-0.375, -0.375, -0.375),
         (0.0, 0.0, 0.0),
-        (0.5, -0.5, 0.25),  # turning round: it brakes first
+        (0.5, -0.5, 0.25),  # reversing: it brakes first
         (0.125, -0.5, 0.0),
         (-0.125, 0.5, 0.0),
         (0.25, -0.0625, 0.0),
@@ -177,7 +177,7 @@ def test_a_step_along_each_linear_axis(current: float, target: float, after: flo
         (1.0, 1.25, 1.25),
     ],
 )
-def test_a_step_of_turning(current: float, target: float, after: float) -> None:
+def test_a_step_of_the_yaw_rate(current: float, target: float, after: float) -> None:
     assert ramp(Velocity(angular_z=current), Velocity(angular_z=target), LIMITS, 0.125) == Velocity(
         angular_z=after
     )
@@ -186,7 +186,7 @@ def test_a_step_of_turning(current: float, target: float, after: float) -> None:
 @pytest.mark.parametrize(
     ("current", "target", "after"),
     [
-        (0.5, 0.0, 0.25),  # braking, as ever
+        (0.5, 0.0, 0.25),  # braking, as in ramp
         (-0.5, 0.0, -0.25),
         (0.5, 0.375, 0.375),
         (-0.5, -0.375, -0.375),
@@ -195,7 +195,7 @@ def test_a_step_of_turning(current: float, target: float, after: float) -> None:
         (-0.125, -0.5, -0.125),
         (0.0, 0.5, 0.0),
         (0.0, -0.5, 0.0),
-        (0.5, -0.5, 0.5),  # nor round
+        (0.5, -0.5, 0.5),  # no reversing
         (-0.5, 0.5, -0.5),
         (0.0, 0.0, 0.0),
     ],
@@ -230,7 +230,7 @@ def test_no_wheel_is_too_fast_while_one_axis_takes_over_from_the_other(
     sign: int, side: int
 ) -> None:
     turning, straight = Velocity(angular_z=2.0 * side), Velocity(linear_x=0.5 * sign)
-    # turning gives up 0.25 rad/s, which is 0.0625 m/s of a wheel; 1/16 s would allow as much
+    # turning loses 0.25 rad/s, which frees 0.0625 m/s of a wheel: the gain that 1/16 s allows
     assert ramp(turning, straight, WHEELS, 0.0625) == Velocity(
         linear_x=0.0625 * sign, angular_z=1.75 * side
     )
@@ -243,7 +243,7 @@ def test_no_wheel_is_too_fast_while_one_axis_takes_over_from_the_other(
     )
 
 
-def test_a_body_that_is_beyond_the_speed_of_its_wheels_slows_down_and_gains_nothing() -> None:
+def test_a_body_faster_than_its_wheels_slows_down_and_gains_no_speed() -> None:
     pushed = Velocity(linear_x=1.0, angular_z=1.0)
     assert ramp(pushed, Velocity(angular_z=2.0), WHEELS, 0.0625) == Velocity(
         linear_x=0.875, angular_z=1.0
@@ -255,7 +255,7 @@ def test_a_body_that_is_beyond_the_speed_of_its_wheels_slows_down_and_gains_noth
 
 
 @pytest.mark.parametrize("sign", [1, -1])
-def test_a_stop_brakes_both_axes_as_fast_as_they_can_whatever_the_wheels_can(sign: int) -> None:
+def test_a_stop_brakes_both_axes_fully_regardless_of_the_wheel_limit(sign: int) -> None:
     curve = Velocity(linear_x=0.25 * sign, angular_z=1.0)
     assert ramp(curve, ZERO, WHEELS, 0.0625) == Velocity(linear_x=0.125 * sign, angular_z=0.75)
 

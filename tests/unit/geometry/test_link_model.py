@@ -1,4 +1,4 @@
-"""The links of an arm, read without MuJoCo, are where MuJoCo has them."""
+"""The links of an arm, read without MuJoCo, have the same poses as in MuJoCo."""
 
 import mujoco
 import numpy as np
@@ -9,7 +9,7 @@ from gigabrain_zenoh.geometry.link_model import LinkModel, Place
 from tests.places import ROOT
 
 BODIES = ROOT / "drivers/gigabrain_drivers/bodies"
-EVERY_WAY = """
+EVERY_NOTATION = """
 <mujoco>
   <compiler angle="degree" eulerseq="zYx"/>
   <asset><material name="red" rgba="1 0 0 1"/></asset>
@@ -107,15 +107,15 @@ def check_masses(model: mujoco.MjModel, read: LinkModel) -> None:
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_a_model_in_every_way_of_writing_is_where_mujoco_has_it(seed: int) -> None:
+def test_every_notation_gives_the_same_poses_as_mujoco(seed: int) -> None:
     hinge, slide = np.random.default_rng(seed).uniform(-1.0, 1.0, 2)
     moved = slide - 0.1
     follows = 0.01 + 2 * moved + 3 * moved**2
     positions = {"hinge": hinge, "slide": slide}
-    assert check(EVERY_WAY, positions, {"follower": follows}) == 6
+    assert check(EVERY_NOTATION, positions, {"follower": follows}) == 6
 
 
-def test_masses_by_inertial_elements_and_of_ellipsoids_are_those_of_mujoco() -> None:
+def test_masses_of_inertial_elements_and_ellipsoids_match_mujoco() -> None:
     mjcf = """<mujoco><worldbody>
       <body name="given"><geom size="1"/>
         <inertial pos="1 2 3" mass="2" fullinertia="3 4 5 .1 .2 .3"/></body>
@@ -127,7 +127,7 @@ def test_masses_by_inertial_elements_and_of_ellipsoids_are_those_of_mujoco() -> 
 
 
 @pytest.mark.parametrize("body", ["so101", "piper"])
-def test_the_shipped_arms_are_where_mujoco_has_them(body: str) -> None:
+def test_the_shipped_arms_have_the_same_poses_as_in_mujoco(body: str) -> None:
     mjcf = (BODIES / body / "model.xml").read_text("utf-8")
     model = mujoco.MjModel.from_xml_string(mjcf)
     for posture in np.random.default_rng(0).uniform(*model.jnt_range.T, (5, model.njnt)):
@@ -138,7 +138,7 @@ def test_the_shipped_arms_are_where_mujoco_has_them(body: str) -> None:
         assert check(mjcf, positions, tied) == model.ngeom
 
 
-def test_a_root_that_drives_is_the_frame_of_the_robot() -> None:
+def test_a_free_root_has_the_pose_of_the_robot_frame() -> None:
     read = LinkModel(
         "<mujoco><worldbody><body name='base' pos='0 0 1'><freejoint/>"
         "<body name='arm' pos='0 0 .2'><joint name='pan'/></body></body></worldbody></mujoco>"
@@ -172,7 +172,7 @@ BODY = "<mujoco><worldbody><body>{}</body></worldbody></mujoco>"
     ],
     ids=range(15),
 )
-def test_text_that_is_no_model_is_refused_in_one_line(mjcf: str, problem: str) -> None:
+def test_an_invalid_model_is_refused_in_one_line(mjcf: str, problem: str) -> None:
     with pytest.raises(ConfigError, match=f"the arm's model cannot be drawn: .*{problem}") as found:
         LinkModel(mjcf)
     assert "\n" not in str(found.value)

@@ -6,12 +6,12 @@ import pytest
 from gigabrain_zenoh.geometry.se2 import between, compose, inverse, transform, turned, wrap, wrapped
 
 
-def test_what_lies_a_metre_north_is_a_metre_ahead_of_who_looks_north() -> None:
+def test_a_pose_to_the_north_is_ahead_of_a_robot_that_faces_north() -> None:
     here, there = np.array((1.0, 2.0, np.pi / 2)), np.array((1.0, 3.0, np.pi))
     assert between(here, there) == pytest.approx((1.0, 0.0, np.pi / 2))
 
 
-def test_there_and_back_is_where_it_began() -> None:
+def test_a_pose_composed_with_its_inverse_is_the_identity() -> None:
     poses = np.random.default_rng(3).uniform(-4, 4, (50, 3))
     assert np.abs(compose(poses, inverse(poses))).max() < 1e-12
     a, b = poses[:25], poses[25:]
@@ -19,7 +19,7 @@ def test_there_and_back_is_where_it_began() -> None:
 
 
 @pytest.mark.parametrize("yaw", [0.0, np.pi, -np.pi, 3 * np.pi, 2.5])
-def test_a_single_pose_moves_as_one_of_many(yaw: float) -> None:
+def test_a_single_pose_gives_the_same_result_as_one_in_an_array(yaw: float) -> None:
     for a, b in np.random.default_rng(4).uniform(-7, 7, (50, 2, 3)):
         b[2] = yaw
         for move in (compose, between):
@@ -39,6 +39,6 @@ def test_points_are_turned_and_then_moved() -> None:
     assert moved == pytest.approx(np.array(((10.0, 21.0), (8.0, 20.0))))
 
 
-def test_who_is_sure_ahead_and_turns_left_is_sure_to_the_left() -> None:
+def test_a_covariance_turned_left_swaps_x_and_y() -> None:
     covariance = turned(np.diag((0.01, 4.0, 0.5)), np.pi / 2)
     assert covariance == pytest.approx(np.diag((4.0, 0.01, 0.5)))

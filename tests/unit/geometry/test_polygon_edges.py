@@ -16,7 +16,7 @@ def test_each_polygon_is_closed_by_itself() -> None:
     assert begin.tolist() == [*TRIANGLE.tolist(), *SQUARE.tolist()]
 
 
-def test_points_go_round_all_polygons_no_farther_apart_than_asked() -> None:
+def test_points_on_all_edges_are_at_most_one_step_apart() -> None:
     points = points_on_edges([TRIANGLE, SQUARE], 0.07, 200)
     for corner in (*TRIANGLE, *SQUARE):
         assert np.hypot(*(points - corner).T).min() == 0.0
@@ -25,6 +25,6 @@ def test_points_go_round_all_polygons_no_farther_apart_than_asked() -> None:
     assert len(points) == 15 + 21 + 15 + 4 * 3
 
 
-@pytest.mark.parametrize("most", [1, 7])
-def test_a_long_edge_has_no_more_points_than_allowed(most: int) -> None:
-    assert len(points_on_edges([1000.0 * TRIANGLE], 0.05, most)) == 3 * most
+@pytest.mark.parametrize("limit", [1, 7])
+def test_a_long_edge_has_no_more_points_than_allowed(limit: int) -> None:
+    assert len(points_on_edges([1000.0 * TRIANGLE], 0.05, limit)) == 3 * limit

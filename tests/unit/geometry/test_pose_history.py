@@ -1,4 +1,4 @@
-"""Planar poses, and where the robot was of late."""
+"""Planar poses, and the history of odometry poses."""
 
 import math
 
@@ -21,7 +21,7 @@ def parts(pose: Pose | None) -> tuple[float, float, float]:
     return pose.x, pose.y, pose.yaw
 
 
-def test_a_pose_ahead_of_a_robot_that_looks_to_the_left_lies_to_the_left() -> None:
+def test_a_pose_ahead_of_a_robot_that_faces_left_is_to_the_left() -> None:
     robot = Pose(x=1.0, y=2.0, yaw=math.pi / 2)
     found = compose(robot, Pose(x=3.0, y=1.0, yaw=3.0))
     assert parts(found) == pytest.approx((0.0, 5.0, 3.0 - 1.5 * math.pi))
@@ -35,7 +35,7 @@ def test_each_state_is_found_by_its_tick() -> None:
     assert history.newest_tick == 3
 
 
-def test_between_two_states_it_is_worked_out_the_shorter_way_round() -> None:
+def test_between_two_states_yaw_is_interpolated_in_the_shorter_direction() -> None:
     history = of((10, (1.0, 0.0, 3.1)), (14, (2.0, 4.0, -3.1)))
     x, y, yaw = parts(history.at(BOOT, 11))
     assert (x, y) == pytest.approx((1.25, 1.0))
@@ -43,15 +43,15 @@ def test_between_two_states_it_is_worked_out_the_shorter_way_round() -> None:
 
 
 @pytest.mark.parametrize("tick", [0, 9, 15, 1000])
-def test_before_the_first_and_after_the_last_state_nothing_is_known(tick: int) -> None:
+def test_before_the_first_and_after_the_last_state_there_is_no_pose(tick: int) -> None:
     assert of((10, (0.0, 0.0, 0.0)), (14, (1.0, 0.0, 0.0))).at(BOOT, tick) is None
 
 
-def test_over_a_long_gap_nothing_is_made_up() -> None:
+def test_over_a_long_gap_no_pose_is_interpolated() -> None:
     assert of((10, (0.0, 0.0, 0.0)), (21, (1.0, 0.0, 0.0))).at(BOOT, 15) is None
 
 
-def test_a_new_start_of_the_driver_begins_anew() -> None:
+def test_a_restart_of_the_driver_clears_the_history() -> None:
     history = of((10, (5.0, 0.0, 0.0))).then(state(2, pose=(0.0, 0.0, 0.0), boot=8))
     assert history.at(BOOT, 10) is None
     assert history.at(BOOT, 2) is None
@@ -64,7 +64,7 @@ def test_late_and_repeated_states_change_nothing() -> None:
     assert history.then(state(9, pose=(9.0, 0.0, 0.0))) == history
 
 
-def test_it_keeps_two_seconds() -> None:
+def test_the_history_keeps_two_seconds() -> None:
     history = of(*((tick, (tick / 100, 0.0, 0.0)) for tick in range(1, 301)))
     assert history.at(BOOT, 200) is None
     assert parts(history.at(BOOT, 201))[0] == 2.01

@@ -1,4 +1,4 @@
-"""A robot maps as it drives: loops, drift, breaks, and going on after a restart."""
+"""Mapping while driving: loop closures, drift, breaks, and continuing after a restart."""
 
 from dataclasses import dataclass
 from itertools import pairwise
@@ -13,7 +13,7 @@ from gigabrain_zenoh.mapping.keyframes import Scan
 from gigabrain_zenoh.mapping.slam import Estimate, Slam
 from tests.unit.mapping.rooms import Lidar, Walls, box, dead_reckoned, drifting, line
 
-# a corridor round a block, with pillars on both sides so that no stretch is like another
+# a corridor around a block, with pillars on both sides so that no two parts are similar
 BLOCK = np.array(
     [
         *box(-1, -1, 12, 10), *box(1, 1, 8, 6),
@@ -23,11 +23,11 @@ BLOCK = np.array(
     ]
 )  # fmt: skip
 
-NOISE = np.diag((0.003, 0.003, 0.001)) ** 2  # of good odometry from scan to scan
+NOISE = np.diag((0.003, 0.003, 0.001)) ** 2  # covariance of good odometry from scan to scan
 
 
 def lap() -> Floats:
-    """Once round the block and a bit farther, the robot always looking ahead."""
+    """Poses once around the block and a bit farther; the robot faces its direction of travel."""
     corners = np.array([(0, 0), (10, 0), (10, 8), (0, 8), (0, 0), (4, 0)], float)
     legs = []
     for start, end in pairwise(corners):
@@ -37,7 +37,7 @@ def lap() -> Floats:
 
 
 def feed(slam: Slam, scans: list[Scan], steps: Floats) -> list[Estimate]:
-    """Add the scans after these steps of odometry, loops being closed after each."""
+    """Add each scan after its odometry step, and close loops after each."""
     estimates = []
     for scan, step in zip(scans, steps, strict=True):
         estimates.append(slam.add(scan, step))
@@ -62,7 +62,7 @@ def stepped(poses: Floats, turn: float, scale: float) -> Floats:
 
 @dataclass(frozen=True)
 class Drive:
-    """A lap, as the lidar and bad odometry tell it."""
+    """A lap as measured by the lidar and by bad odometry."""
 
     poses: Floats
     scans: list[Scan]
@@ -82,7 +82,7 @@ def mapped(drive: Drive) -> tuple[Slam, list[Estimate]]:
     return slam, feed(slam, drive.scans, drive.steps)
 
 
-def test_a_loop_takes_back_what_odometry_has_drifted(
+def test_a_loop_closure_corrects_the_drift_of_the_odometry(
     drive: Drive, mapped: tuple[Slam, list[Estimate]]
 ) -> None:
     slam, estimates = mapped
@@ -96,7 +96,7 @@ def test_a_loop_takes_back_what_odometry_has_drifted(
     assert not estimates[-1].lost
 
 
-def test_neither_matches_nor_the_map_depend_on_when_loops_are_closed(
+def test_matches_and_map_do_not_depend_on_when_loops_are_closed(
     drive: Drive, mapped: tuple[Slam, list[Estimate]]
 ) -> None:
     at_once, _ = mapped
@@ -108,7 +108,7 @@ def test_neither_matches_nor_the_map_depend_on_when_loops_are_closed(
     assert later.poses.tolist() == at_once.poses.tolist()
 
 
-def test_a_correction_carries_along_what_has_come_since(drive: Drive) -> None:
+def test_a_correction_also_moves_the_keyframes_added_since(drive: Drive) -> None:
     slam = Slam()
     correction = None
     for scan, step in zip(drive.scans, drive.steps, strict=True):
@@ -129,7 +129,7 @@ def test_a_correction_carries_along_what_has_come_since(drive: Drive) -> None:
 
 
 @pytest.mark.parametrize(("reach", "uprights"), [(1.5, 0), (2.5, 8)])
-def test_an_aisle_is_not_taken_for_the_next_one_like_it(reach: float, uprights: int) -> None:
+def test_an_aisle_is_not_confused_with_a_similar_one(reach: float, uprights: int) -> None:
     racks = [wall for k in range(3) for wall in box(1.6 * k, 0, 0.4, 8)]
     for k in range(uprights):
         racks += [wall for x in (0.4, 1.5, 2.0, 3.1) for wall in box(x, k + 0.3, 0.1, 0.1)]
@@ -145,7 +145,7 @@ def test_an_aisle_is_not_taken_for_the_next_one_like_it(reach: float, uprights: 
 
 
 def passed_by(noise: Floats | None) -> float:
-    """Return the error along a bare aisle while a crate moves beside the robot [m], + ahead."""
+    """Return the error [m] along a bare aisle while a crate moves beside the robot; + is ahead."""
     poses = line(np.array((0.0, 0.0, 0.0)), np.array((2.0, 0.0, 0.0)), 0.025)
     lidar, slam = Lidar(180, reach=4.0), Slam()
     steps = stepped(poses, 0.0, 1.0)
@@ -155,12 +155,12 @@ def passed_by(noise: Floats | None) -> float:
     return float(found.pose[0] - poses[-1, 0])
 
 
-def test_good_odometry_holds_an_aisle_where_all_that_can_be_seen_along_it_moves() -> None:
+def test_good_odometry_keeps_the_position_in_an_aisle_with_only_moving_landmarks() -> None:
     assert abs(passed_by(NOISE)) < 0.06
     assert abs(passed_by(None)) > 0.2
 
 
-def test_wheels_that_slip_are_found_out_however_good_odometry_says_it_is() -> None:
+def test_wheel_slip_is_corrected_even_if_odometry_reports_low_noise() -> None:
     lidar, slam = Lidar(180, reach=6.0), Slam()
     for _ in range(20):
         found = slam.add(lidar.scan(BLOCK, IDENTITY), np.array((0.03, 0.0, 0.0)), NOISE)
@@ -168,10 +168,10 @@ def test_wheels_that_slip_are_found_out_however_good_odometry_says_it_is() -> No
 
 
 @pytest.mark.parametrize("turn", [0.1, 0.15, 0.2])
-def test_where_little_of_a_scan_is_known_doors_alike_are_not_taken_for_one_another(
+def test_similar_doors_are_not_confused_if_little_of_a_scan_is_known(
     turn: float,
 ) -> None:
-    # backwards, two metres a scan, looking ahead; odometry turns too far at each
+    # backwards, 2 m per scan, with a lidar that faces ahead; odometry overestimates each turn
     doors: list[tuple[float, float, float, float]] = []
     for x, y, deep in [(2.0 * k + off, y, 1.35 * y) for k in range(18)
                        for off, y in ((-4.0, 1.0), (-3.4, -1.0))]:  # fmt: skip
@@ -185,7 +185,7 @@ def test_where_little_of_a_scan_is_known_doors_alike_are_not_taken_for_one_anoth
     slam = Slam(pose=poses[0])
     estimates = feed(slam, look(np.array(doors), poses, lidar), np.array(steps))
     assert {estimate.kind for estimate in estimates} == {"matched"}
-    assert estimates[-1].pose == pytest.approx(poses[-1], abs=0.1)  # one door on is 2 m
+    assert estimates[-1].pose == pytest.approx(poses[-1], abs=0.1)  # the next door is 2 m away
 
 
 def test_a_slow_robot_keeps_one_scan_in_ten() -> None:
@@ -196,7 +196,7 @@ def test_a_slow_robot_keeps_one_scan_in_ten() -> None:
     assert estimates[-1].pose == pytest.approx(poses[-1], abs=0.03)
 
 
-def test_noise_on_two_walls_turns_the_robot_to_neither_side() -> None:
+def test_noise_on_two_walls_does_not_turn_the_robot() -> None:
     corridor = np.array([(-40.0, 1.0, 140.0, 1.0), (-40.0, -1.0, 140.0, -1.0)])
     poses = line(np.zeros(3), np.array((100.0, 0.0, 0.0)), 0.5)
     turns = []
@@ -206,10 +206,12 @@ def test_noise_on_two_walls_turns_the_robot_to_neither_side() -> None:
         slam = Slam()
         feed(slam, look(corridor, poses, lidar), stepped(poses, 0.0, 1.0))
         turns.append(np.degrees(slam.smooth[2]))
-    assert np.abs(turns) == pytest.approx(0.0, abs=1.5)  # where it is turned: 5 and more
+    assert np.abs(turns) == pytest.approx(
+        0.0, abs=1.5
+    )  # a robot that is turned: 5 degrees and more
 
 
-def test_a_robot_that_is_carried_away_says_so_until_it_is_told_where_it_is() -> None:
+def test_a_robot_that_is_carried_away_is_lost_until_it_is_relocated() -> None:
     poses = lap()[:60]
     lidar = Lidar(180, reach=6.0)
     slam = Slam()
@@ -228,7 +230,7 @@ def test_a_robot_that_is_carried_away_says_so_until_it_is_told_where_it_is() -> 
     assert found.pose == pytest.approx(home, abs=0.03)
 
 
-def test_scans_that_do_not_even_fit_one_another_do_not_break_the_map() -> None:
+def test_scans_that_do_not_fit_each_other_do_not_break_the_map() -> None:
     poses = lap()[:40]
     random = np.random.default_rng(4)
     scans = look(BLOCK, poses, Lidar(180, reach=6.0))
@@ -242,7 +244,7 @@ def test_scans_that_do_not_even_fit_one_another_do_not_break_the_map() -> None:
     assert estimates[-1].pose == pytest.approx(poses[-1], abs=0.05)
 
 
-def test_when_odometry_jumps_the_scan_tells_that_the_robot_did_not() -> None:
+def test_a_jump_of_the_odometry_is_corrected_by_the_scan() -> None:
     poses = lap()[:30]
     lidar = Lidar(180, reach=6.0)
     slam = Slam()
@@ -254,7 +256,7 @@ def test_when_odometry_jumps_the_scan_tells_that_the_robot_did_not() -> None:
         slam.add(lidar.scan(BLOCK, poses[-1]), np.array((np.nan, 0.0, 0.0)))
 
 
-def test_with_nothing_in_sight_odometry_carries_on_and_the_doubt_grows() -> None:
+def test_without_hits_the_odometry_is_used_and_the_covariance_grows() -> None:
     poses = line(np.array((0.0, 0.0, 0.0)), np.array((4.0, 0.0, 0.0)), 0.1)
     lidar = Lidar(180)
     slam = Slam()
@@ -266,7 +268,7 @@ def test_with_nothing_in_sight_odometry_carries_on_and_the_doubt_grows() -> None
     assert blind[-1].covariance[0, 0] > 10 * blind[0].covariance[0, 0]
 
 
-def test_what_was_frozen_goes_on_as_if_it_had_not_been(
+def test_a_thawed_map_continues_like_one_that_was_never_frozen(
     drive: Drive, mapped: tuple[Slam, list[Estimate]]
 ) -> None:
     whole, _ = mapped
@@ -282,7 +284,7 @@ def test_what_was_frozen_goes_on_as_if_it_had_not_been(
     assert again.behind == 0
 
 
-def test_arrays_that_do_not_belong_together_are_refused() -> None:
+def test_inconsistent_arrays_are_refused() -> None:
     slam = Slam()
     feed(slam, look(BLOCK, lap()[:6], Lidar(90)), stepped(lap()[:6], 0.0, 1.0))
     frozen = slam.freeze()

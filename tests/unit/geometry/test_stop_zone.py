@@ -1,4 +1,4 @@
-"""Stopping distances, against the table that was worked out by hand, and the room there is."""
+"""Stopping distances match a table that was computed by hand, and the stop zone follows them."""
 
 import pytest
 from hypothesis import given
@@ -11,13 +11,13 @@ from gigabrain_zenoh.testing.samples import WAFFLE
 
 
 def body(reaction_time: float = 0.32) -> BodyDescription:
-    """1 m/s², and 0.08 m of margin."""
+    """Return a body with 1 m/s² of deceleration and a margin of 0.08 m."""
     thresholds = Thresholds(reaction_time=reaction_time, stop_margin=0.08)
     return replace(WAFFLE, thresholds=thresholds)
 
 
 def forward(reaction_time: float = 0.32) -> Brake:
-    """That body's brake."""
+    """Return the forward brake of `body`."""
     return brakes(body(reaction_time))["forward"]
 
 
@@ -44,7 +44,7 @@ def test_the_speed_cap_matches_the_table() -> None:
 
 
 @given(st.floats(0.081, 10.0), st.floats(0.01, 2.0), st.floats(0.1, 5.0))
-def test_the_speed_cap_is_the_speed_that_needs_all_of_the_room(
+def test_the_speed_cap_needs_exactly_the_free_distance(
     free: float, reaction_time: float, deceleration: float
 ) -> None:
     some = replace(body(reaction_time), max_linear_deceleration=deceleration)
@@ -58,7 +58,7 @@ def test_the_speed_cap_is_the_speed_that_needs_all_of_the_room(
         (0.163, 0.2, False, True),  # L(0.2) = 0.164 m
         (0.165, 0.2, False, False),
         (0.165, 0.2, True, True),
-        (0.179, 0.0, True, True),  # L(0) = 0.08 m and 0.10 m more
+        (0.179, 0.0, True, True),  # L(0) = 0.08 m, plus 0.10 m to resume
         (0.181, 0.0, True, False),
         (0.081, 0.0, False, False),
         (0.079, 0.0, False, True),
@@ -66,15 +66,15 @@ def test_the_speed_cap_is_the_speed_that_needs_all_of_the_room(
         (None, 0.26, True, False),
     ],
 )
-def test_the_stop_zone_has_the_stopping_distance_and_a_margin_to_leave_it(
+def test_the_stop_zone_is_the_stopping_distance_plus_a_margin_to_resume(
     free: float | None, speed: float, stopped: bool, stays: bool
 ) -> None:
     assert forward().in_zone(free, speed, stopped) is stays
 
 
-def test_a_cap_is_stated_only_where_it_limits_the_body() -> None:
+def test_a_cap_is_returned_only_if_it_limits_the_body() -> None:
     assert forward().cap(None, stopped=False) is None
-    assert forward().cap(0.5, stopped=False) is None  # 0.651 m/s would do, the body has 0.26
+    assert forward().cap(0.5, stopped=False) is None  # 0.651 m/s is allowed, above the body's 0.26
     assert forward().cap(0.15, stopped=False) == pytest.approx(0.172, abs=0.001)
     assert forward().cap(0.5, stopped=True) == 0.0
 

@@ -1,4 +1,4 @@
-"""Plausible poses of a scan, judged by the walls that its beams would have passed through."""
+"""Poses of a scan are implausible if its beams would have passed through walls."""
 
 import numpy as np
 import pytest
@@ -26,40 +26,40 @@ def scan(walls: Floats, pose: Floats) -> Scan:
     return Lidar(180, reach=6.0).scan(walls, pose)
 
 
-def test_a_scan_looks_through_nothing_where_it_was_taken() -> None:
+def test_a_scan_at_its_true_pose_passes_through_no_walls() -> None:
     shown, there = scan(ROOM, IDENTITY).points, np.array((0.4, -0.5, 0.6))
     assert seen_through(shown, scan(ROOM, there).points, there) == pytest.approx(0.0, abs=0.02)
 
 
 @pytest.mark.long
-def test_a_scan_looks_through_the_walls_of_a_place_that_is_smaller() -> None:
+def test_a_scan_passes_through_the_walls_of_a_smaller_room() -> None:
     shown = scan(np.array(box(-1.5, -1.5, 3, 3)), IDENTITY).points
     assert seen_through(shown, scan(ROOM, IDENTITY).points, IDENTITY) > 0.5
 
 
-def test_what_lies_behind_a_wall_is_not_in_view() -> None:
+def test_points_behind_a_wall_are_not_in_view() -> None:
     shown = scan(ROOM, IDENTITY).points
     near = scan(np.array(box(-1.5, -1.5, 3, 3)), IDENTITY).points
     assert np.isnan(seen_through(shown, near, IDENTITY))
 
 
-def test_of_a_place_that_shows_nothing_nothing_is_said() -> None:
+def test_without_points_there_is_no_result() -> None:
     nothing = np.empty((0, 2), np.float32)
     assert np.isnan(seen_through(nothing, scan(ROOM, IDENTITY).points, IDENTITY))
     assert np.isnan(seen_through(scan(ROOM, IDENTITY).points, nothing, IDENTITY))
 
 
 @pytest.mark.long
-def test_a_robot_that_backs_along_a_corridor_does_not_slide_back_over_what_it_knows() -> None:
-    """Half of each scan is new then: what fits best is a place too far ahead."""
+def test_a_robot_that_reverses_along_a_corridor_does_not_slip_back_over_known_parts() -> None:
+    """Half of each scan is new then, and the best match is too far ahead."""
     poses = line(np.array((5.0, 0.0, 0.0)), np.array((-25.0, 0.1, 0.0)), 1.0)
     steps = np.concatenate((IDENTITY[None], drifting(poses, turn=0.01, scale=1.04)))
     off = []
     for seed in range(1, 4):
         lidar = Lidar(180, reach=6.0, seed=seed)
-        lidar.angles = np.radians(np.arange(-90.0, 90.0))  # it looks ahead only
+        lidar.angles = np.radians(np.arange(-90.0, 90.0))  # it faces ahead only
         slam = Slam(poses[0])
         for pose, step in zip(poses, steps, strict=True):
             estimate = slam.add(lidar.scan(CORRIDOR, pose), step)
         off.append(np.hypot(*between(poses[-1], estimate.pose)[:2]))
-    assert max(off) < 1.5  # 5 % of the way, along which little tells it from others
+    assert max(off) < 1.5  # 5 % of the way, along which most places look similar

@@ -1,4 +1,4 @@
-"""Perception: when a lidar counts as blind, and its scan is not believed."""
+"""Perception rejects the scan of a blind or stuck lidar."""
 
 import math
 
@@ -27,7 +27,7 @@ def blind(values: NDArray[np.floating], lidar: Lidar = LIDAR) -> str:
 
 
 def some(bad: float, count: int) -> NDArray[np.float64]:
-    """A believable scan of which the beams from behind on are `bad`."""
+    """Return a plausible scan with `count` beams that are `bad`, from the rear on."""
     values = np.linspace(2.0, 3.0, 360)
     values[90 : 90 + count] = bad
     return values
@@ -52,12 +52,12 @@ def test_a_lidar_that_reports_one_distance_all_round_is_stuck(constant: float) -
     assert blind(almost) == ""
 
 
-def test_a_single_range_finder_is_not_stuck_for_having_one_beam() -> None:
+def test_a_range_finder_with_one_beam_is_not_stuck() -> None:
     assert blind(np.array([1.5]), replace(LIDAR, beams=1)) == ""
 
 
 @pytest.mark.parametrize("count", [1, 180, 359, 361, 720])
-def test_a_scan_of_another_length_is_not_believed(count: int) -> None:
+def test_a_scan_of_another_length_is_rejected(count: int) -> None:
     assert blind(np.linspace(2, 3, count)) == f"the scan has {count} beams, the body's lidar 360"
 
 
@@ -69,10 +69,10 @@ def test_all_inf_is_free_space_unless_the_lidar_cannot_tell() -> None:
     assert blind(some(INF, 179), unsure) == ""
 
 
-def test_a_lidar_that_sees_all_but_what_is_ahead_is_blind() -> None:
+def test_a_lidar_without_beams_ahead_is_blind() -> None:
     values = np.linspace(2.0, 3.0, 360)
     values[:8] = values[-7:] = NAN
-    assert blind(values) == ""  # 16 of the 31 beams in the cone still say something
+    assert blind(values) == ""  # 16 of the 31 beams in the cone are still valid
     values[8] = NAN
     assert blind(values) == "16 of 31 beams ahead are missing"
 

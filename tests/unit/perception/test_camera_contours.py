@@ -1,4 +1,4 @@
-"""Contours of cameras in the world that perception publishes: where, of when, and whether."""
+"""Camera contours in perception's worlds: their positions, ages and camera statuses."""
 
 import functools
 from collections.abc import Callable
@@ -43,7 +43,7 @@ MAPPING = pytest.mark.parametrize("mapping", ["off", "slam"])
 
 
 class Bench(NodeBench):
-    """Perception, and a body with one depth camera that drives along x."""
+    """Perception of a body that drives along x with one depth camera."""
 
     def __init__(self, mapping: str = "off", boot: int = BOOT) -> None:
         config = PerceptionConfig(mapping=mapping)  # type: ignore[arg-type]
@@ -57,12 +57,12 @@ class Bench(NodeBench):
         self.drive(tick)
 
     def drive(self, tick: int, x: float | None = None) -> None:
-        """Be at x [m] at a tick."""
+        """Send the state of a body at x [m] at a tick."""
         self.pose = self.pose if x is None else replace(self.pose, x=x)
         self.send(STATE, state(tick, pose=(self.pose.x, 0.0, 0.0), boot=self.boot))
 
     async def look(self, tick: int, picture: DepthImage | None = None, name: str = "front") -> None:
-        """Take a picture of BOX from where it is, and wait until it is done with."""
+        """Send a picture of BOX from the body's position, and wait until it is processed."""
         seen = millimetres(LOW, depth_of(LOW, (BOX,), pose=self.pose))
         picture = replace(picture or image(seen), boot=self.boot, tick=tick, basis=tick)
         self.network.deliver(DEPTH.at(name), codec.encode(picture))
@@ -72,7 +72,7 @@ class Bench(NodeBench):
         await self.clock.advance(0)
 
     async def world(self, tick: int) -> WorldModel:
-        """Return the world of a scan at a tick."""
+        """Send a scan at a tick, and return its world."""
         self.sent(WORLD)
         self.send(SCAN, scan(open_space(), tick, boot=self.boot))
         await self.settled()
@@ -90,7 +90,7 @@ def front_of(world: WorldModel) -> float:
 
 
 @MAPPING
-async def test_what_a_camera_sees_is_in_the_next_world_where_it_is_then(mapping: str) -> None:
+async def test_the_next_world_has_the_contours_of_a_picture_moved_to_its_pose(mapping: str) -> None:
     async with Bench(mapping) as bench:
         await bench.begin()
         await bench.look(1)
@@ -103,7 +103,7 @@ async def test_what_a_camera_sees_is_in_the_next_world_where_it_is_then(mapping:
 
 
 @MAPPING
-async def test_a_picture_brings_the_newest_world_again_with_its_contours(mapping: str) -> None:
+async def test_a_picture_republishes_the_newest_world_with_its_contours(mapping: str) -> None:
     async with Bench(mapping) as bench:
         await bench.begin()
         before = await bench.world(1)
@@ -120,8 +120,8 @@ async def test_a_picture_brings_the_newest_world_again_with_its_contours(mapping
 
 
 @MAPPING
-async def test_a_scan_from_a_place_that_is_not_known_hides_no_contours(mapping: str) -> None:
-    """Perception was busy, and of the states meanwhile only the newest came through."""
+async def test_a_scan_without_a_pose_has_contours_at_the_newest_pose(mapping: str) -> None:
+    """Perception was busy, so that it received only the newest of several states."""
     async with Bench(mapping) as bench:
         await bench.begin()
         await bench.look(1)
@@ -133,7 +133,7 @@ async def test_a_scan_from_a_place_that_is_not_known_hides_no_contours(mapping: 
         assert near(bench.sent(WORLD)[-1].contours, 0.85, 0.0)
 
 
-async def test_a_picture_that_comes_before_the_state_of_its_tick_waits_for_it() -> None:
+async def test_a_picture_waits_for_the_state_of_its_tick() -> None:
     async with Bench() as bench:
         await bench.begin()
         await bench.look(2)
@@ -147,7 +147,7 @@ def no_picture(status: CameraStatus) -> bool:
     return "no picture" in status.problem
 
 
-async def test_a_camera_that_is_silent_withheld_or_wrong_is_not_ok_and_says_why() -> None:
+async def test_a_camera_that_is_silent_withheld_or_wrong_is_not_ok_with_a_reason() -> None:
     async with Bench() as bench:
         await bench.begin()
         first = status(await bench.world(1))
@@ -172,7 +172,7 @@ async def test_a_camera_that_is_silent_withheld_or_wrong_is_not_ok_and_says_why(
         wrong = status(await bench.world(28))
         assert not wrong.ok
         assert "320 x 240" in wrong.problem
-        assert near((await bench.world(28)).contours, 0.95, 0.0)  # what was seen stays
+        assert near((await bench.world(28)).contours, 0.95, 0.0)  # the contours are kept
         bench.drive(33)
         await bench.look(33, replace(small, frame_id="rear"))
         assert "'rear'" in status(await bench.world(33)).problem
@@ -203,7 +203,7 @@ async def test_broken_pictures_are_refused_and_perception_goes_on(
 
 
 @pytest.mark.long
-async def test_a_flood_costs_no_more_than_the_rate_of_the_camera() -> None:
+async def test_a_flood_of_pictures_is_processed_at_the_rate_of_the_camera() -> None:
     async with Bench() as bench:
         await bench.begin()
         for tick in range(1, 101):
@@ -211,11 +211,11 @@ async def test_a_flood_costs_no_more_than_the_rate_of_the_camera() -> None:
             await bench.look(tick)
         assert bench.bus.counters[SKIPPED] >= 60
         await bench.look(100, name="stranger")
-        await bench.look(1)  # an old one
+        await bench.look(1)  # an old picture
         assert status(await bench.world(100)).exposure > 95
 
 
-async def test_a_restarted_driver_begins_with_nothing_seen() -> None:
+async def test_a_restart_of_the_driver_clears_the_contours() -> None:
     async with Bench() as bench:
         await bench.begin()
         await bench.look(1)
@@ -229,8 +229,8 @@ async def test_a_restarted_driver_begins_with_nothing_seen() -> None:
         assert (await bench.world(3)).contours
 
 
-async def test_a_body_that_has_become_higher_sees_what_is_in_its_way_now() -> None:
-    """Its driver was restarted with another file, and its cameras are the same."""
+async def test_a_higher_body_gets_contours_that_were_above_the_lower_one() -> None:
+    """The driver was restarted with another file; the cameras are the same."""
     beam = Box(x=1.0, y=0.0, half_x=0.05, half_y=0.2, top=0.45, bottom=0.3)
     seen = image(millimetres(LOW, depth_of(LOW, (beam,))))
     async with Bench() as bench:
@@ -274,7 +274,7 @@ def jpeg(pixels: NDArray[np.uint8]) -> bytes:
 
 
 class Late(PatientJournal):
-    """Keeps the work in progress until a test ends it."""
+    """An executor whose only job lasts until a test ends it."""
 
     def __init__(self) -> None:
         self.unfinished: list[tuple[Job, Callable[[Job], None]]] = []
@@ -283,14 +283,14 @@ class Late(PatientJournal):
         self.unfinished.append((job, then))
 
     def end_one(self) -> None:
-        """End the only work in progress."""
+        """End the only job."""
         (one,) = self.unfinished
         self.unfinished.clear()
         super().when_done(*one)
 
 
-async def test_a_picture_that_waits_at_the_end_is_left() -> None:
-    """The work in progress ends behind the node; nothing is begun then."""
+async def test_a_picture_that_waits_at_the_end_is_dropped() -> None:
+    """The job ends after the node, and no other one begins then."""
     async with Bench() as bench:
         bench.bus.input_log = late = Late()
         await bench.begin()
@@ -302,8 +302,8 @@ async def test_a_picture_that_waits_at_the_end_is_left() -> None:
 
 
 @pytest.mark.parametrize("behind", [0, 25])
-async def test_cameras_take_turns_where_a_look_takes_as_long_as_a_period(behind: int) -> None:
-    """Also where the pictures of one are older when they come."""
+async def test_cameras_take_turns_if_a_picture_takes_a_whole_period(behind: int) -> None:
+    """This also holds if the pictures of one camera arrive late."""
     async with Bench() as bench:
         bench.bus.input_log = late = Late()
         await bench.ready()
@@ -359,7 +359,7 @@ class Noting(PatientJournal):
 
 @pytest.mark.long
 async def test_a_replay_gives_the_same_worlds() -> None:
-    """What a thread has done counts from where the log says, and not when it is done again."""
+    """The result of a job is used where the log says, not when the replayed job ends."""
     async with Bench("slam") as bench:
         events = record(bench.network, bench.clock)
         bench.bus.input_log = Noting(events, bench.clock)

@@ -1,4 +1,4 @@
-"""Things that are recognised become objects in the map, and those that are gone are forgotten."""
+"""Recognised things become objects in the map; missing ones are forgotten."""
 
 import math
 
@@ -25,7 +25,7 @@ CAN = (2.0, 0.3, 0.06)
 
 
 class Eye:
-    """A robot that looks, and recognises with noise."""
+    """A robot that recognises things with noise."""
 
     def __init__(self, seed: int = 3, noise: float = 0.0) -> None:
         self.memory, self.pose, self.time_s = ObjectMemory(), np.zeros(3), 0.0
@@ -79,7 +79,7 @@ def test_after_ten_pictures_an_object_is_within_5_cm(noise: float, distance: flo
     assert np.percentile(errors, 95) < 0.05
 
 
-def test_its_class_is_the_one_that_was_seen_from_farther_off() -> None:
+def test_the_class_is_the_one_seen_from_farther_away() -> None:
     eye = Eye()
     eye.look(("can", (0.7, 0.0, 0.06)), pictures=10)
     eye.pose = np.array((0.4, 0.0, 0.0))
@@ -98,7 +98,7 @@ def test_a_single_glimpse_is_no_object() -> None:
     assert eye.labels == ["can"]
 
 
-def test_what_one_in_ten_pictures_shows_is_an_object() -> None:
+def test_a_thing_in_one_of_ten_pictures_is_an_object() -> None:
     eye = Eye()
     for _ in range(3):
         assert eye.labels == []
@@ -107,11 +107,11 @@ def test_what_one_in_ten_pictures_shows_is_an_object() -> None:
     assert eye.labels == ["can"]
 
 
-def test_what_was_carried_away_is_forgotten_when_its_place_is_looked_at() -> None:
+def test_an_object_that_was_taken_away_is_forgotten_when_its_place_is_seen() -> None:
     eye = Eye()
     eye.look(("can", CAN), pictures=20)
     eye.look(pictures=3)
-    assert eye.labels == ["can"]  # not at once: a net misses things
+    assert eye.labels == ["can"]  # not at once: a network misses things
     eye.look(pictures=5)
     assert eye.labels == []
 
@@ -120,12 +120,14 @@ def test_what_was_carried_away_is_forgotten_when_its_place_is_looked_at() -> Non
     ("pose", "hits"),
     [
         ((0.0, 0.0, math.pi), NOTHING),  # behind the robot
-        ((-3.0, 0.0, 0.0), NOTHING),  # far off
-        ((0.0, 0.0, 0.0), np.array(((1.0, 0.15), (1.0, 0.16)))),  # somebody stands before it
+        ((-3.0, 0.0, 0.0), NOTHING),  # far away
+        ((0.0, 0.0, 0.0), np.array(((1.0, 0.15), (1.0, 0.16)))),  # somebody stands in front of it
         ((1.85, 0.3, 0.0), NOTHING),  # below the picture
     ],
 )
-def test_what_cannot_be_seen_stays(pose: tuple[float, float, float], hits: Floats) -> None:
+def test_an_object_that_cannot_be_seen_is_kept(
+    pose: tuple[float, float, float], hits: Floats
+) -> None:
     eye = Eye()
     eye.look(("can", CAN), pictures=20)
     eye.pose, eye.hits = np.array(pose), hits
@@ -133,7 +135,7 @@ def test_what_cannot_be_seen_stays(pose: tuple[float, float, float], hits: Float
     assert eye.labels == ["can"]
 
 
-def test_a_thing_behind_another_in_the_picture_stays() -> None:
+def test_an_object_behind_another_one_in_the_picture_is_kept() -> None:
     eye = Eye()
     behind, before = (2.2, 0.0, 0.06), (1.0, 0.0, 0.06)
     eye.look(("can", behind), pictures=20)
@@ -141,7 +143,7 @@ def test_a_thing_behind_another_in_the_picture_stays() -> None:
     assert sorted(eye.labels) == ["box", "can"]
 
 
-def test_while_the_robot_turns_fast_nothing_is_missed() -> None:
+def test_while_the_robot_turns_fast_nothing_is_forgotten() -> None:
     eye = Eye()
     eye.look(("can", CAN), pictures=20)
     for _ in range(30):
@@ -151,7 +153,7 @@ def test_while_the_robot_turns_fast_nothing_is_missed() -> None:
     assert eye.labels == ["can"]
 
 
-def test_people_and_robots_are_followed_and_soon_forgotten() -> None:
+def test_people_and_robots_are_tracked_and_soon_forgotten() -> None:
     eye = Eye()
     for k in range(15):
         eye.look(("person", (1.5 + 0.08 * k, 0.0, 0.9)))
@@ -170,7 +172,7 @@ def test_two_things_side_by_side_are_two_and_one_thing_is_one() -> None:
     assert sorted(eye.labels) == ["ball", "can", "can"]
 
 
-def test_a_can_that_is_sometimes_taken_for_a_cylinder_is_a_can() -> None:
+def test_a_can_that_is_sometimes_recognised_as_a_cylinder_is_a_can() -> None:
     eye = Eye(noise=0.02)
     for k in range(30):
         eye.look(("cylinder" if k % 3 == 1 else "can", CAN))
@@ -190,14 +192,16 @@ def test_objects_move_with_the_keyframes_of_their_map() -> None:
     eye.look(("can", CAN), pictures=5)
     poses = np.array(((0.0, 0.0, 0.0), (1.5, 0.0, 0.0)))
     eye.memory.follow(poses)
-    poses = np.array(((0.0, 0.0, 0.0), (1.5, 0.5, math.pi / 2)))  # it turns left by a loop
+    poses = np.array(
+        ((0.0, 0.0, 0.0), (1.5, 0.5, math.pi / 2))
+    )  # a loop closure turns it to the left
     eye.memory.follow(poses)
     (one,) = eye.memory.objects()
     assert (one.x, one.y) == pytest.approx((1.5 - 0.3, 0.5 + 0.5), abs=0.01)
     assert eye.memory.anchored()[0][1].keyframe == 1  # type: ignore[union-attr]
 
 
-def test_what_hangs_on_a_keyframe_turns_with_it() -> None:
+def test_a_position_turns_with_its_keyframe() -> None:
     tag = np.array((1.0, 0.0, 0.5, 3.0))
     moved, anchor = carried(tag, Anchor(0, np.zeros(3)), np.array(((0.0, 0.0, 0.3),)))
     assert moved[3] == pytest.approx(3.3 - math.tau)
@@ -206,7 +210,7 @@ def test_what_hangs_on_a_keyframe_turns_with_it() -> None:
     assert same is moved
 
 
-def test_memory_goes_on_after_saving_and_loading_and_keeps_its_ids() -> None:
+def test_a_restored_memory_continues_with_the_same_ids() -> None:
     eye = Eye()
     eye.look(("can", CAN), ("box", (1.0, 0.0, 0.1)), pictures=20)
     other = Eye()
@@ -219,7 +223,7 @@ def test_memory_goes_on_after_saving_and_loading_and_keeps_its_ids() -> None:
 
 
 @pytest.mark.slow
-def test_thousands_of_things_anywhere_are_bounded_and_keep_what_is_sure() -> None:
+def test_memory_is_bounded_and_keeps_confirmed_objects() -> None:
     eye = Eye()
     eye.look(("can", CAN), pictures=20)
     random = np.random.default_rng(1)
@@ -243,7 +247,7 @@ def test_thousands_of_things_anywhere_are_bounded_and_keep_what_is_sure() -> Non
     assert all(abs(one.x) < 9 and max(one.size) <= 5 for one in eye.memory.objects())
 
 
-def test_a_detection_without_a_place_is_no_object() -> None:
+def test_a_detection_without_a_position_is_no_object() -> None:
     eye = Eye()
     blind = Detection(label="can", confidence=1.0, box=(0, 0, 9, 9))
     for _ in range(9):
@@ -253,7 +257,7 @@ def test_a_detection_without_a_place_is_no_object() -> None:
     assert eye.labels == []
 
 
-def test_as_many_things_and_tags_as_are_kept_fit_into_a_message_and_a_file() -> None:
+def test_the_maximum_of_objects_and_tags_fits_into_a_message_and_a_file() -> None:
     things = tuple(
         MapObject(
             id=2**63 - 1 - k,

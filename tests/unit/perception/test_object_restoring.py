@@ -1,4 +1,4 @@
-"""The next perception process goes on with the things and tags of the map."""
+"""The next perception process continues with the objects and tags of the map."""
 
 import asyncio
 from pathlib import Path
@@ -27,8 +27,8 @@ def _own_state(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
 
 
-def keeper(folder: Path, boot: int, *, restored: bool = False) -> ObjectServer:
-    """Return that of a process which begins with a map that grows."""
+def server(folder: Path, boot: int, *, restored: bool = False) -> ObjectServer:
+    """Return the server of a new process with a growing map."""
     new = ObjectServer(Net().one, str(folder), OdometryFusion)
     new.use_map("", "slam")
     if restored:
@@ -37,9 +37,9 @@ def keeper(folder: Path, boot: int, *, restored: bool = False) -> ObjectServer:
     return new
 
 
-def knowing(folder: Path) -> ObjectServer:
-    """Return that of a process which has seen a can and a tag."""
-    new = keeper(folder, 7)
+def server_with_objects(folder: Path) -> ObjectServer:
+    """Return the server of a process that has seen a can and a tag."""
+    new = server(folder, 7)
     new.memory.restore([(CAN, None)])
     new.tags.restore([(TAG, None)])
     new.publish(500)
@@ -50,47 +50,49 @@ def known(found: ObjectServer) -> list[str | int]:
     return [*(one.label for one in found.present.objects), *(one.id for one in found.present.tags)]
 
 
-async def test_things_of_a_map_that_was_saved_meanwhile_outlive_perception(tmp_path: Path) -> None:
-    first = knowing(tmp_path)
+async def test_objects_of_a_map_saved_meanwhile_survive_a_restart_of_perception(
+    tmp_path: Path,
+) -> None:
+    first = server_with_objects(tmp_path)
     first.saved_as("office")
     await first.finish_writing()
-    second = keeper(tmp_path, 7, restored=True)
+    second = server(tmp_path, 7, restored=True)
     second.publish(600)
     await second.finish_writing()
-    third = keeper(tmp_path, 7, restored=True)  # the name lasts as well
+    third = server(tmp_path, 7, restored=True)  # the name is also kept
     await third.finish_writing()
     assert known(second) == known(third) == ["can", 5]
     assert b'"map":"office"' in (tmp_path / "objects.json").read_bytes()
 
 
-async def test_things_outlive_a_restart_of_the_driver_and_then_of_perception(
+async def test_objects_survive_restarts_of_the_driver_and_then_of_perception(
     tmp_path: Path,
 ) -> None:
-    first = knowing(tmp_path)
+    first = server_with_objects(tmp_path)
     first.restart(8)
     await first.finish_writing()
-    second = keeper(tmp_path, 8, restored=True)
+    second = server(tmp_path, 8, restored=True)
     await second.finish_writing()
     assert known(second) == ["can", 5]
 
 
-async def test_things_of_a_map_are_not_restored_into_one_that_was_loaded_since(
+async def test_objects_are_not_restored_into_a_map_that_was_loaded_since(
     tmp_path: Path,
 ) -> None:
     object_file.save(map_file.saved_map_path("office"), ObjectFile(tags=(TAG,)))
-    first = knowing(tmp_path)
+    first = server_with_objects(tmp_path)
     first.use_map("office", "slam")
     await first.finish_writing()
-    second = keeper(tmp_path, 7, restored=True)
+    second = server(tmp_path, 7, restored=True)
     await second.finish_writing()
     assert known(second) == [5]
 
 
-async def test_what_could_not_be_written_is_written_once_there_is_room(tmp_path: Path) -> None:
-    """Nothing new is seen meanwhile."""
+async def test_a_failed_write_is_repeated_once_there_is_room(tmp_path: Path) -> None:
+    """Nothing new is seen in the meantime."""
     folder = tmp_path / "full"
     folder.write_text("no folder can be made here")
-    found = knowing(folder)
+    found = server_with_objects(folder)
     await found.finish_writing()
     await asyncio.sleep(0)
     (unsaved,) = found.problems()
@@ -104,7 +106,7 @@ async def test_what_could_not_be_written_is_written_once_there_is_room(tmp_path:
 
 
 def scan(found: ObjectServer, tick: int, *, localized: bool) -> None:
-    """Let the robot stand at the origin of the map, where it sees nothing."""
+    """Process a scan at the origin of the map, where the robot sees nothing."""
     still = np.zeros(3)
     seen = Surroundings(
         WAFFLE, WorldModel(scan_ok=True, obstacle_ahead=False), np.empty((0, 2)), np.zeros((1, 3))
@@ -122,7 +124,7 @@ def scan(found: ObjectServer, tick: int, *, localized: bool) -> None:
         (ObjectsRequest(ids=(1,), tags=(9,)), ["can", 5]),  # refused: there is no tag 9
     ],
 )
-async def test_what_a_person_forgot_is_not_back_when_the_robot_is_lost_right_after(
+async def test_forgotten_objects_do_not_return_when_the_robot_is_then_lost(
     asked: ObjectsRequest, left: list[str | int]
 ) -> None:
     net = Net()

@@ -1,4 +1,4 @@
-"""Things that are followed from scan to scan: their places, speeds and sizes, and who is who."""
+"""Tracked obstacles: their positions, speeds, sizes and ids."""
 
 import math
 from collections.abc import Callable
@@ -24,7 +24,7 @@ HERE = Pose(x=0.0, y=0.0, yaw=0.0)
 def measured(
     lidar: Lidar, pose: Pose, walls: tuple[Wall, ...], discs: tuple[Disc, ...], fov: float
 ) -> tuple[Floats, Floats]:
-    """Ranges and angles of the beams, in the lidar's frame."""
+    """Return ranges and angles of the beams in the lidar's frame."""
     angles = np.linspace(-fov / 2, fov / 2, lidar.beams, endpoint=False)
     cosine, sine = math.cos(pose.yaw), math.sin(pose.yaw)
     x = pose.x + cosine * lidar.x - sine * lidar.y
@@ -69,7 +69,7 @@ class Watch:
     def scan(
         self, *discs: Disc, pose: Pose = HERE, believed: Pose | None = None
     ) -> tuple[Obstacle, ...]:
-        """One scan more, from `pose`, where the odometry has `believed` instead."""
+        """Add a scan from `pose`; `believed` is a different pose by the odometry."""
         self.tick += round(50 / self.hz)
         self.t = self.tick * 0.02
         ranges, angles = measured(self.lidar, pose, self.walls, discs, self.fov)
@@ -87,7 +87,7 @@ class Watch:
     def walk(
         self, path: Callable[[float], tuple[float, float]], scans: int, radius: float = 0.25
     ) -> list[tuple[Obstacle, ...]]:
-        """So many scans of somebody who is at `path(t)`, in the robot's frame at the origin."""
+        """Add scans of a person at `path(t)` by a robot at the origin."""
         return [self.scan((*path(self.t + 1 / self.hz), radius)) for _ in range(scans)]
 
 
@@ -102,7 +102,7 @@ def speed(one: Obstacle) -> float:
 @pytest.mark.long
 @pytest.mark.parametrize("v", [0.5, 1.0])
 @pytest.mark.parametrize("distance", [1.0, 2.0])
-def test_a_person_who_crosses_is_followed_with_the_right_speed(v: float, distance: float) -> None:
+def test_a_crossing_person_is_tracked_with_the_right_speed(v: float, distance: float) -> None:
     watch = Watch()
     seen = watch.walk(lambda t: (distance, -1.2 + v * t), round(20 / v / 1.0) + 4)
     ids = set()
@@ -118,7 +118,7 @@ def test_a_person_who_crosses_is_followed_with_the_right_speed(v: float, distanc
     assert len(ids) == 1
 
 
-def test_a_person_who_comes_straight_on_is_followed_too() -> None:
+def test_an_approaching_person_is_tracked() -> None:
     watch = Watch()
     *_, obstacles = watch.walk(lambda t: (3.5 - 0.8 * t, 0.1), 25)
     person = nearest(obstacles, 1.5, 0.1)
@@ -126,7 +126,7 @@ def test_a_person_who_comes_straight_on_is_followed_too() -> None:
     assert person.velocity_y == pytest.approx(0.0, abs=0.1)
 
 
-def test_a_post_stands_and_so_do_walls_and_corners() -> None:
+def test_posts_walls_and_corners_stand() -> None:
     watch = Watch()
     for _ in range(50):
         obstacles = watch.scan((1.5, 0.5, 0.06), (-1.0, 1.0, 0.15))
@@ -155,7 +155,7 @@ def box(x: float, y: float, half_x: float, half_y: float) -> tuple[Wall, ...]:
     )
 
 
-def test_what_only_shows_another_side_to_a_robot_that_drives_past_does_not_move() -> None:
+def test_a_thing_that_only_shows_another_side_to_a_passing_robot_stands() -> None:
     things = (*box(0.0, 0.8, 0.35, 0.2), *box(1.2, -0.9, 0.1, 0.4), *box(2.4, 0.9, 0.3, 0.3))
     stub: tuple[Wall, ...] = ((0.6, 3, 0.6, 2.0), (-1.5, -3, -1.5, -1.9))
     watch, told = Watch(walls=(*ROOM, *things, *stub)), 0
@@ -167,14 +167,14 @@ def test_what_only_shows_another_side_to_a_robot_that_drives_past_does_not_move(
     assert told > 100
 
 
-def test_whoever_moves_in_the_open_is_seen_to_move_though_no_wall_is_behind() -> None:
+def test_motion_is_detected_without_a_wall_behind() -> None:
     for lidar, fov in ((WIDE, math.tau), (JACKAL, math.radians(270))):
         watch = Watch(lidar, (), fov=fov)
         *_, obstacles = watch.walk(lambda t: (2.0, -0.8 + 0.6 * t), 15)
         assert nearest(obstacles, 2.0, 0.1).velocity_y == pytest.approx(0.6, abs=0.1)
 
 
-def test_what_comes_into_view_as_the_robot_turns_does_not_move() -> None:
+def test_a_thing_that_comes_into_view_as_the_robot_turns_stands() -> None:
     watch = Watch(JACKAL, ROOM, fov=math.radians(270))
     for i in range(80):
         pose = Pose(x=0.0, y=0.0, yaw=0.1 * i)
@@ -208,7 +208,7 @@ def test_a_wall_is_no_obstacle_but_a_person_in_front_of_it_is() -> None:
     assert (obstacles[0].x, obstacles[0].y) == pytest.approx((2.0, -2.3), abs=0.07)
 
 
-def test_the_rest_of_a_wall_beside_a_persons_shadow_does_not_run_away() -> None:
+def test_the_wall_beside_a_persons_shadow_does_not_move() -> None:
     watch = Watch()
     seen = watch.walk(lambda t: (1.0, -2.0 + 0.6 * t), 60)
     for i, obstacles in enumerate(seen[10:], 10):
@@ -217,7 +217,7 @@ def test_the_rest_of_a_wall_beside_a_persons_shadow_does_not_run_away() -> None:
         assert others == []
 
 
-def test_whoever_is_hidden_for_three_scans_keeps_the_id_and_the_speed() -> None:
+def test_a_person_hidden_for_three_scans_keeps_id_and_speed() -> None:
     watch = Watch()
     path: Callable[[float], tuple[float, float]] = lambda t: (2.0, -1.0 + 0.8 * t)  # noqa: E731
     *_, before = watch.walk(path, 12)
@@ -231,7 +231,7 @@ def test_whoever_is_hidden_for_three_scans_keeps_the_id_and_the_speed() -> None:
     assert math.hypot(found.velocity_x, found.velocity_y - 0.8) < 0.1
 
 
-def test_whoever_walks_behind_a_post_is_still_the_same() -> None:
+def test_a_person_who_walks_behind_a_post_keeps_the_id() -> None:
     watch, ids = Watch(), set()
     for i in range(30):
         y = -1.2 + 0.08 * (i + 1)
@@ -241,7 +241,7 @@ def test_whoever_walks_behind_a_post_is_still_the_same() -> None:
     assert len(ids) == 1
 
 
-def test_whoever_is_gone_is_forgotten_within_half_a_second() -> None:
+def test_a_person_who_is_gone_is_forgotten_within_half_a_second() -> None:
     watch = Watch()
     *_, obstacles = watch.walk(lambda t: (1.5, 0.0), 8)
     assert len(obstacles) == 1
@@ -249,7 +249,7 @@ def test_whoever_is_gone_is_forgotten_within_half_a_second() -> None:
     assert told == [1, 1, 1, 1, 0, 0]
 
 
-def test_whoever_is_hidden_for_longer_is_forgotten_within_a_second() -> None:
+def test_a_hidden_person_is_forgotten_after_a_second() -> None:
     watch = Watch()
     watch.walk(lambda t: (2.5, 0.0), 8)
     screen = [[one.id for one in watch.scan((1.2, 0.0, 0.5))] for _ in range(11)]
@@ -257,14 +257,14 @@ def test_whoever_is_hidden_for_longer_is_forgotten_within_a_second() -> None:
     assert 1 not in screen[10]
 
 
-def test_whoever_stops_stands() -> None:
+def test_a_person_who_stops_stands() -> None:
     watch = Watch()
     watch.walk(lambda t: (2.0, min(0.0, -1.0 + 0.7 * t)), 15)
     *_, obstacles = watch.walk(lambda t: (2.0, 0.0), 15)
     assert speed(nearest(obstacles, 2.0, 0.0)) == 0.0
 
 
-def test_two_who_pass_one_another_keep_their_ids() -> None:
+def test_two_people_who_pass_each_other_keep_their_ids() -> None:
     watch = Watch()
     for i in range(26):
         s = -1.3 + 0.1 * (i + 1)
@@ -302,7 +302,7 @@ def test_noise_of_3_cm_and_lost_beams_break_nothing_into_pieces() -> None:
 
 
 @pytest.mark.long
-def test_the_covariance_says_how_far_off_it_may_be() -> None:
+def test_the_covariance_matches_the_errors() -> None:
     errors = []
     for seed in range(20):
         watch = Watch(seed=seed)
@@ -312,10 +312,10 @@ def test_the_covariance_says_how_far_off_it_may_be() -> None:
         assert np.all(np.linalg.eigvalsh(c) > 0)
         off = np.array([person.x - 2.0, person.y, person.velocity_x, person.velocity_y - 0.5])
         errors.append(float(off @ np.linalg.solve(c, off)))
-    assert 0.05 < np.mean(errors) < 8.0  # 4 if speeds changed as much as it allows for
+    assert 0.05 < np.mean(errors) < 8.0  # 4 if speeds changed as much as the filter assumes
 
 
-def test_a_turning_robot_finds_who_crosses_where_the_odometry_says() -> None:
+def test_a_turning_robot_tracks_a_crossing_person_in_the_odometry_frame() -> None:
     watch = Watch()
     for i in range(20):
         y = -1.0 + 0.06 * (i + 1)
@@ -325,7 +325,7 @@ def test_a_turning_robot_finds_who_crosses_where_the_odometry_says() -> None:
     assert (person.velocity_x, person.velocity_y) == pytest.approx((0.0, 0.6), abs=0.1)
 
 
-def test_a_new_start_of_the_driver_and_a_long_silence_begin_anew() -> None:
+def test_a_restart_of_the_driver_and_a_long_gap_clear_all_tracks() -> None:
     watch = Watch()
     watch.walk(lambda t: (2.0, 0.0), 5)
     hits = np.array([[2.0, 0.05], [1.98, 0.0], [2.0, -0.05]])
@@ -335,14 +335,14 @@ def test_a_new_start_of_the_driver_and_a_long_silence_begin_anew() -> None:
     assert watch.scan((2.0, 0.0, 0.25)) == ()
 
 
-def test_a_scan_that_comes_twice_changes_nothing() -> None:
+def test_a_repeated_scan_changes_nothing() -> None:
     watch = Watch()
     *_, obstacles = watch.walk(lambda t: (2.0, 0.2 * t), 8)
     again = watch.tracker.update(np.empty((0, 2)), WIDE, 0.0175, HERE, 7, watch.tick)
     assert again == obstacles
 
 
-def test_of_very_many_things_the_nearest_are_reported() -> None:
+def test_the_nearest_of_very_many_things_are_published() -> None:
     bearings = [math.tau * i / 80 for i in range(80)]
     many = [((2 + a / 10) * math.cos(a), (2 + a / 10) * math.sin(a), 0.04) for a in bearings]
     lidar = Lidar(beams=2880, rate_hz=10, range_min=0.1, range_max=12.0)

@@ -1,4 +1,4 @@
-"""Quick things that turn, and those of which only a part can be seen."""
+"""Quick things that turn, and partly hidden things."""
 
 import math
 
@@ -14,7 +14,7 @@ RADIUS = 0.5
 
 
 def rim(begin: float, end: float, count: int) -> np.ndarray:
-    """Points on a disc of RADIUS at (2.0, 1.0), between two bearings [degrees] from its middle."""
+    """Return points on the rim of a disc of RADIUS at (2.0, 1.0), between two angles [degrees]."""
     angles = np.radians(np.linspace(begin, end, count))
     return np.column_stack((2.0 + RADIUS * np.cos(angles), 1.0 + RADIUS * np.sin(angles)))
 
@@ -23,7 +23,7 @@ def off(one: Obstacle, vx: float, vy: float) -> float:
     return math.hypot(one.velocity_x - vx, one.velocity_y - vy)
 
 
-def test_a_third_of_a_rim_says_where_the_middle_is() -> None:
+def test_a_third_of_a_rim_shows_the_centre() -> None:
     place = fit_disc(rim(150, 270, 20), 2.1, 1.08, RADIUS)
     assert place is not None
     x, y, noise = place
@@ -31,7 +31,7 @@ def test_a_third_of_a_rim_says_where_the_middle_is() -> None:
     assert noise < 0.01
 
 
-def test_the_less_of_a_rim_is_seen_the_less_sure_is_its_middle() -> None:
+def test_a_shorter_arc_gives_a_less_certain_centre() -> None:
     wide, narrow = (fit_disc(rim(210 - a, 210 + a, 20), 2.0, 1.0, RADIUS) for a in (60, 8))
     assert wide is not None
     assert narrow is not None
@@ -44,7 +44,7 @@ def test_a_wall_and_a_few_hits_are_no_rim() -> None:
     assert fit_disc(rim(150, 270, 3), 2.0, 1.0, RADIUS) is None
 
 
-def test_a_quick_thing_that_turns_back_is_believed_within_a_fifth_of_a_second() -> None:
+def test_a_reversal_of_a_quick_thing_is_detected_within_a_fifth_of_a_second() -> None:
     watch = Watch(JACKAL, (), hz=25.0)
     turn = 1.2
     seen = watch.walk(lambda t: (3.0, -1.5 + 1.7 * (turn - abs(t - turn))), 36, RADIUS)
@@ -56,7 +56,7 @@ def test_a_quick_thing_that_turns_back_is_believed_within_a_fifth_of_a_second() 
     assert len([o for o in after if math.hypot(o.velocity_x, o.velocity_y) > 0.3]) == 1
 
 
-def test_what_passes_behind_a_post_keeps_its_speed_though_only_a_part_of_it_is_seen() -> None:
+def test_a_partly_hidden_thing_keeps_its_speed_behind_a_post() -> None:
     watch, post = Watch(JACKAL, (), hz=25.0), (1.5, 0.0, 0.2)
     for scan in range(1, 76):
         y = -1.8 + 1.2 * scan / 25
@@ -67,10 +67,10 @@ def test_what_passes_behind_a_post_keeps_its_speed_though_only_a_part_of_it_is_s
             assert math.hypot(one.x - 3.0, one.y - y) < 0.1
 
 
-def test_what_leaves_the_field_of_view_does_not_seem_to_turn() -> None:
+def test_a_thing_that_leaves_the_field_of_view_does_not_seem_to_turn() -> None:
     watch = Watch(JACKAL, (), hz=25.0, fov=math.radians(270))
     for scan in range(1, 66):
-        x = 1.5 - 1.5 * scan / 25  # past the robot and away behind it
+        x = 1.5 - 1.5 * scan / 25  # past the robot and on behind it
         obstacles = watch.scan((x, 1.4, RADIUS))
         if scan > 20:
             one = nearest(obstacles, x, 1.4)
@@ -83,7 +83,7 @@ def test_the_field_of_view_turns_with_the_lidar(yaw: float) -> None:
     lidar = Lidar(beams=181, rate_hz=10.0, range_min=0.1, range_max=10.0, yaw=yaw)
 
     def is_whole(bearing: float) -> bool:
-        """Return whether an arc `bearing` [rad] off the lidar's axis is seen to both its ends."""
+        """Return whether both ends of an arc at `bearing` [rad] from the lidar's axis are seen."""
         bearings = yaw + bearing + np.radians(np.arange(-5, 6))
         hits = 2.0 * np.column_stack((np.cos(bearings), np.sin(bearings)))
         (cluster,) = find_clusters(hits, lidar, math.radians(1.0))
@@ -112,7 +112,7 @@ def test_a_wall_a_hollow_and_a_few_hits_are_no_disc() -> None:
     assert discs_of(np.empty((0, 2)), (0.0, 0.0), RADIUS) == []
 
 
-def test_what_goes_along_behind_another_is_followed_though_nobody_saw_the_whole_of_it() -> None:
+def test_a_thing_that_was_never_seen_whole_is_tracked_behind_another() -> None:
     watch = Watch(JACKAL, (), hz=25.0)
     for scan in range(1, 41):
         y = -1.4 + 1.2 * scan / 25
@@ -124,7 +124,7 @@ def test_what_goes_along_behind_another_is_followed_though_nobody_saw_the_whole_
 
 
 @pytest.mark.parametrize(("speed", "known"), [(1.5, True), (0.45, False)])
-def test_behind_the_robot_what_is_quick_is_known_of_for_longer(speed: float, known: bool) -> None:
+def test_a_quick_thing_behind_the_robot_is_remembered_for_longer(speed: float, known: bool) -> None:
     watch = Watch(JACKAL, (), hz=25.0, fov=math.radians(270))
     hidden = 2.0 / speed + 1.3  # it is 1.2 m aside and begins 0.6 m ahead
     for _ in range(round(25 * hidden)):

@@ -1,4 +1,4 @@
-"""Perception: what counts as ahead, what counts as near, and when a lidar counts as blind."""
+"""Perception: obstacles ahead, the nearest hits per sector, and blind lidars."""
 
 import functools
 import math
@@ -22,7 +22,7 @@ from gigabrain_zenoh.testing.samples import BOOT, LIDAR, WAFFLE, body, open_spac
 
 NAN, INF = math.nan, math.inf
 CONFIG = PerceptionConfig()
-CONE_ALONE = PerceptionConfig(corridor=0.0)  # leaves the strip no longer than the body itself
+CONE_ALONE = PerceptionConfig(corridor=0.0)  # the strip is no longer than the body itself
 
 
 def see(values: NDArray[np.floating], config: PerceptionConfig = CONFIG) -> WorldModel:
@@ -101,7 +101,7 @@ def test_left_and_right_are_not_swapped_when_the_lidar_turns_clockwise() -> None
     assert step(CONFIG, WAFFLE, clockwise).sectors[9] == pytest.approx(2.0)
 
 
-def test_a_lidar_behind_the_middle_sees_the_obstacle_nearer_to_the_body() -> None:
+def test_hits_of_a_lidar_behind_the_middle_are_nearer_to_the_body() -> None:
     world = step(CONFIG, with_lidar(x=-0.064), scan(open_space(deg_0=1.05)))
     assert world.obstacle_ahead
     assert world.distance_ahead == pytest.approx(0.986)
@@ -157,8 +157,8 @@ def test_any_number_of_sectors_covers_the_whole_turn(count: int) -> None:
     assert None not in world.sectors
 
 
-def obvious(config: PerceptionConfig, body: BodyDescription, message: LaserScan) -> WorldModel:
-    """The same, beam by beam."""
+def beam_by_beam(config: PerceptionConfig, body: BodyDescription, message: LaserScan) -> WorldModel:
+    """Compute the same beam by beam."""
     lidar = body.lidar
     assert lidar
     ahead, sectors = [], [INF] * config.sectors
@@ -200,7 +200,7 @@ def obvious(config: PerceptionConfig, body: BodyDescription, message: LaserScan)
         sectors=st.integers(4, 32),
     ),
 )
-def test_it_agrees_with_the_obvious_way_beam_by_beam(
+def test_the_result_matches_a_computation_beam_by_beam(
     ranges: list[float],
     angle_min: float,
     direction: int,
@@ -212,7 +212,7 @@ def test_it_agrees_with_the_obvious_way_beam_by_beam(
     increment = direction * 2 * math.pi / 24
     message = scan(np.array(ranges), angle_min=angle_min, angle_increment=increment)
     body = replace(WAFFLE, lidar=lidar)
-    world, slow = step(config, body, message), obvious(config, body, message)
+    world, slow = step(config, body, message), beam_by_beam(config, body, message)
     if not world.scan_ok:
         return
     assert world.obstacle_ahead is slow.obstacle_ahead
@@ -221,14 +221,14 @@ def test_it_agrees_with_the_obvious_way_beam_by_beam(
 
 
 @given(st.binary(min_size=4, max_size=1440).map(lambda raw: raw[: len(raw) // 4 * 4]))
-def test_no_bit_pattern_breaks_it(raw: bytes) -> None:
+def test_any_bit_pattern_gives_a_world(raw: bytes) -> None:
     count = len(raw) // 4
     message = replace(scan(np.zeros(count)), ranges=raw)
     world = step(CONFIG, with_lidar(beams=count), message)
     assert world.distance_ahead is None or 0 <= world.distance_ahead < 10
 
 
-async def test_each_scan_becomes_a_world_that_rests_on_it() -> None:
+async def test_each_scan_becomes_a_world_based_on_it() -> None:
     async with NodeBench(functools.partial(perception.run, CONFIG)) as bench:
         bench.send(BODY, body())
         bench.send(SCAN, scan(open_space(deg_0=0.8), tick=5))
@@ -240,12 +240,14 @@ async def test_each_scan_becomes_a_world_that_rests_on_it() -> None:
     assert not second.obstacle_ahead
 
 
-async def test_without_its_body_it_says_nothing() -> None:
+async def test_without_a_body_no_world_is_published() -> None:
     async with NodeBench(functools.partial(perception.run, CONFIG)) as bench:
         bench.send(SCAN, scan(open_space(), tick=5))
         bench.send(BODY, body())
         for tick in (4, 7, 10):
-            bench.send(SCAN, scan(open_space(), tick=tick, boot=8))  # another start: another body
+            bench.send(
+                SCAN, scan(open_space(), tick=tick, boot=8)
+            )  # another boot, so the body is unknown
         assert bench.sent(WORLD) == []
         bench.send(BODY, body(boot=8))
         bench.send(SCAN, scan(open_space(), tick=15, boot=8))

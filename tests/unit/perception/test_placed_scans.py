@@ -1,4 +1,4 @@
-"""Scans meet the states of their ticks, and perception finds obstacles with them."""
+"""Scans wait for the states of their ticks, so that perception can track obstacles."""
 
 import functools
 
@@ -34,7 +34,7 @@ class Handed:
         self.placed.scan(scan(open_space(), tick, boot=boot))
 
 
-def test_a_scan_is_handed_on_with_the_pose_of_its_tick() -> None:
+def test_a_scan_is_passed_on_with_the_pose_of_its_tick() -> None:
     handed = Handed()
     handed.state(4, 0.4)
     handed.state(5, 0.5)
@@ -42,7 +42,7 @@ def test_a_scan_is_handed_on_with_the_pose_of_its_tick() -> None:
     assert handed.all == [(4, 0.4)]
 
 
-def test_a_scan_of_a_tick_whose_state_is_still_on_its_way_waits_for_it() -> None:
+def test_a_scan_waits_for_the_state_of_its_tick() -> None:
     handed = Handed()
     handed.scan(5)
     handed.state(4, 0.4)
@@ -52,7 +52,7 @@ def test_a_scan_of_a_tick_whose_state_is_still_on_its_way_waits_for_it() -> None
     assert (handed.all, handed.missed) == ([(5, 0.5)], [])
 
 
-def test_a_scan_from_the_future_waits_until_the_next_takes_its_place() -> None:
+def test_a_scan_from_the_future_waits_until_the_next_scan_replaces_it() -> None:
     handed = Handed()
     handed.state(5)
     handed.scan(5000)
@@ -61,7 +61,7 @@ def test_a_scan_from_the_future_waits_until_the_next_takes_its_place() -> None:
     assert (handed.all, handed.missed) == ([(5, 0.0)], [5000])
 
 
-def test_of_a_tick_long_past_the_place_is_not_known() -> None:
+def test_a_scan_of_a_tick_long_ago_has_no_pose() -> None:
     handed = Handed()
     handed.state(5)
     handed.state(50)
@@ -79,7 +79,7 @@ def test_a_scan_of_another_start_of_the_driver_waits_for_its_state() -> None:
 
 
 def round_post(x: float, y: float) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
-    """A post of 0.2 m radius in open space, and a wall 3 m behind the robot."""
+    """Return ranges to a post of 0.2 m radius in open space, and to a wall 3 m behind the robot."""
     angles = np.radians(np.arange(360.0))
     along = x * np.cos(angles) + y * np.sin(angles)
     square = 0.2**2 - x * x - y * y + along**2
@@ -89,7 +89,7 @@ def round_post(x: float, y: float) -> np.ndarray[tuple[int], np.dtype[np.float64
 
 
 async def drive(config: PerceptionConfig) -> list[tuple[float, float, float]]:
-    """The robot drives 0.5 m/s past somebody who walks towards it at 0.5 m/s; what it follows."""
+    """Drive at 0.5 m/s past a person who approaches at 0.5 m/s; return the tracked obstacles."""
     async with NodeBench(functools.partial(perception.run, config)) as bench:
         await bench.ready()
         bench.send(BODY, body())
@@ -104,10 +104,10 @@ async def drive(config: PerceptionConfig) -> list[tuple[float, float, float]]:
     return [(o.x, o.velocity_x, o.radius) for o in worlds[-1].obstacles]
 
 
-async def test_perception_follows_obstacles_while_it_makes_a_map() -> None:
+async def test_perception_tracks_obstacles_while_mapping() -> None:
     (found,) = await drive(MAPPING)
     assert found == pytest.approx((2.5, -0.5, 0.2), abs=0.08)
 
 
-async def test_perception_follows_nothing_without_a_map() -> None:
+async def test_perception_tracks_nothing_without_mapping() -> None:
     assert await drive(PerceptionConfig()) == []

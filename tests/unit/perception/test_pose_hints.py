@@ -21,7 +21,7 @@ async def said(request):
     return reply, None if hint is None else hint.covariance
 
 
-async def test_a_covariance_that_is_given_is_kept():
+async def test_a_given_covariance_is_used():
     request = PoseRequest(
         x=1.0, y=2.0, yaw=0.5, covariance=(0.25, 0.0, 0.01, 0.0, 0.36, 0.0, 0.01, 0.0, 0.07)
     )
@@ -31,23 +31,23 @@ async def test_a_covariance_that_is_given_is_kept():
     assert spread == pytest.approx(np.array(expected), abs=2e-6)
 
 
-async def test_without_one_it_is_that_of_what_a_person_says():
+async def test_without_a_covariance_that_of_a_person_is_used():
     _, spread = await said(PoseRequest(x=1.0, y=2.0, yaw=0.5))
     assert spread == pytest.approx(np.diag((0.09, 0.09, 0.0625)))
 
 
-async def test_any_heading_is_looked_for_whatever_the_covariance_says_of_it():
+async def test_without_a_yaw_any_heading_is_searched():
     given = (0.04, 0.0, 0.01, 0.0, 0.04, 0.0, 0.01, 0.0, 0.01)
     _, spread = await said(PoseRequest(x=0.0, y=0.0, covariance=given))
     assert spread == pytest.approx(np.diag((0.04, 0.04, (np.pi / 2) ** 2)), abs=2e-6)
 
 
-async def test_a_covariance_of_zeros_still_leaves_room_to_look_in():
+async def test_a_covariance_of_zeros_is_enlarged_for_the_search():
     _, spread = await said(PoseRequest(x=0.0, y=0.0, yaw=0.0, covariance=(0.0,) * 9))
     assert np.linalg.eigvalsh(spread).min() > 0
 
 
-async def test_one_with_a_negative_eigenvalue_is_refused():
+async def test_a_covariance_with_a_negative_eigenvalue_is_refused():
     given = (0.1, 0.0, 0.0, 0.0, -0.1, 0.0, 0.0, 0.0, 0.1)
     reply, spread = await said(PoseRequest(x=0.0, y=0.0, yaw=0.0, covariance=given))
     assert not reply.ok

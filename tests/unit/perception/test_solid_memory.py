@@ -1,4 +1,4 @@
-"""Things near an arm over several pictures: the median counts, what moved or went is followed."""
+"""Things near an arm over several pictures: medians, moved things and missing things."""
 
 import math
 
@@ -28,7 +28,7 @@ def only(memory: SolidMemory, pose: Pose = ORIGIN, tick: int = 1) -> SeenSolid:
     return one
 
 
-def test_a_thing_counts_from_its_second_picture_on_by_the_median() -> None:
+def test_a_thing_is_confirmed_by_its_second_picture_and_has_the_median_fit() -> None:
     memory = SolidMemory()
     looked(memory, box(0.200, 0.1), tick=1)
     assert memory.solids(ORIGIN, 1) == ()
@@ -39,7 +39,7 @@ def test_a_thing_counts_from_its_second_picture_on_by_the_median() -> None:
     assert only(memory, tick=55).age == pytest.approx(1.0)
 
 
-def test_two_things_side_by_side_keep_their_numbers() -> None:
+def test_two_things_side_by_side_keep_their_ids() -> None:
     memory = SolidMemory()
     for tick, first in enumerate((box(0.2, 0.0), box(0.201, 0.0), box(0.199, 0.0)), start=1):
         looked(memory, *((first, can(0.2, 0.06)) if tick % 2 else (can(0.2, 0.06), first)))
@@ -47,7 +47,7 @@ def test_two_things_side_by_side_keep_their_numbers() -> None:
     assert (near.id, near.shape, far.id, far.shape) == (2, "box", 3, "cylinder")
 
 
-def test_a_thing_that_was_moved_is_where_it_is_now() -> None:
+def test_a_thing_that_was_moved_gets_its_new_position() -> None:
     memory = SolidMemory()
     for tick in range(1, 6):
         looked(memory, can(0.2, 0.0), tick=tick)
@@ -56,7 +56,7 @@ def test_a_thing_that_was_moved_is_where_it_is_now() -> None:
     assert only(memory).id == 2
 
 
-def test_a_thing_that_is_seen_through_goes_and_one_that_is_hidden_stays() -> None:
+def test_a_thing_that_is_seen_through_is_forgotten_and_a_hidden_one_is_kept() -> None:
     memory = SolidMemory()
     for tick in (1, 2):
         looked(memory, can(0.2, 0.0), tick=tick)
@@ -69,7 +69,7 @@ def test_a_thing_that_is_seen_through_goes_and_one_that_is_hidden_stays() -> Non
 
 
 @pytest.mark.long
-def test_what_was_not_seen_for_long_is_forgotten_and_there_are_not_too_many() -> None:
+def test_old_things_are_forgotten_and_their_number_is_bounded() -> None:
     memory = SolidMemory()
     for tick in (1, 2):
         looked(memory, *(can(0.1 * k, 1.0) for k in range(MAX_SOLIDS + 20)), tick=tick)
@@ -78,7 +78,7 @@ def test_what_was_not_seen_for_long_is_forgotten_and_there_are_not_too_many() ->
     assert memory.solids(ORIGIN, 3) == ()
 
 
-def test_a_body_that_has_driven_on_finds_the_thing_in_its_own_frame() -> None:
+def test_things_are_published_in_the_frame_of_a_body_that_drove_on() -> None:
     memory = SolidMemory()
     before, there = Pose(x=1.0, y=2.0, yaw=math.pi / 2), Pose(x=1.0, y=2.2, yaw=math.pi)
     for tick in (1, 2):
@@ -88,7 +88,7 @@ def test_a_body_that_has_driven_on_finds_the_thing_in_its_own_frame() -> None:
     assert math.remainder(seen.yaw - (0.2 - math.pi / 2), math.pi / 2) == pytest.approx(0.0)
 
 
-def test_yaws_of_a_box_that_jump_by_a_quarter_are_the_same() -> None:
+def test_yaws_of_a_box_a_quarter_turn_apart_are_the_same() -> None:
     memory = SolidMemory()
     for tick, yaw in enumerate((0.78, -0.79, 0.77, -0.78), start=1):
         looked(memory, box(0.2, 0.0, yaw, long=0.02), tick=tick)
@@ -96,24 +96,24 @@ def test_yaws_of_a_box_that_jump_by_a_quarter_are_the_same() -> None:
     assert abs(off) < 0.02
 
 
-def test_the_class_for_which_most_confidence_speaks_of_late_is_its_label() -> None:
+def test_the_label_is_the_class_with_the_most_recent_confidence() -> None:
     memory = SolidMemory()
     for tick in (1, 2):
         looked(memory, can(0.3, 0.0), box(0.5, 0.2), tick=tick)
     for label, confidence, pictures in (("cube", 1.0, 90), ("can", 0.9, 25), ("cylinder", 0.5, 35)):
         for _ in range(pictures):
             memory.name(label, confidence, (0.32, 0.01), 0.6, ORIGIN)
-    memory.name("cube", 1.0, (0.9, 0.9), 0.6, ORIGIN)  # stands nowhere near
+    memory.name("cube", 1.0, (0.9, 0.9), 0.6, ORIGIN)  # nothing is tracked there
     near, far = memory.solids(ORIGIN, 2)
     assert (near.label, far.label) == ("can", "")
 
 
-def test_a_class_that_was_seen_from_farther_off_stays_however_long_a_thing_is_looked_at() -> None:
+def test_a_class_seen_from_farther_away_outlasts_many_near_pictures() -> None:
     memory = SolidMemory()
     for tick in (1, 2):
         looked(memory, can(0.3, 0.0), tick=tick)
     memory.name("cube", 1.0, (0.3, 0.0), 0.2, ORIGIN)
-    assert only(memory).label == "cube"  # it was not seen from anywhere else yet
+    assert only(memory).label == "cube"  # it was only seen from near so far
     for _ in range(6):
         memory.name("can", 0.6, (0.3, 0.0), 0.6, ORIGIN)
     for _ in range(200):
@@ -121,7 +121,7 @@ def test_a_class_that_was_seen_from_farther_off_stays_however_long_a_thing_is_lo
     assert only(memory).label == "can"
 
 
-def test_a_thing_is_known_by_what_was_said_before_it_was_near_enough_to_be_fitted() -> None:
+def test_a_new_track_gets_classes_recognised_before_it_could_be_fitted() -> None:
     memory = SolidMemory()
     memory.name("can", 0.8, (0.9, 0.0), 0.75, ORIGIN)
     memory.name("box", 0.8, (0.9, 0.3), 0.75, ORIGIN)
@@ -132,13 +132,13 @@ def test_a_thing_is_known_by_what_was_said_before_it_was_near_enough_to_be_fitte
     assert only(memory, nearer).label == "can"
 
 
-def test_a_memory_without_anything_is_named_in_vain() -> None:
+def test_a_class_without_a_fit_gives_no_thing() -> None:
     memory = SolidMemory()
     memory.name("can", 0.9, (0.3, 0.0), 0.6, ORIGIN)
     assert memory.solids(ORIGIN, 1) == ()
 
 
-def test_after_a_restart_of_perception_no_thing_gets_the_number_of_another() -> None:
+def test_ids_are_not_reused_after_a_restart_of_perception() -> None:
     before, after = SolidMemory(), SolidMemory()
     for tick in (100, 105):
         looked(before, can(0.2, 0.0), box(0.3, 0.1), tick=tick)

@@ -1,4 +1,4 @@
-"""Tags: their places in the map are averaged, and a known one says where the robot is."""
+"""Tags: their places in the map are averaged, and known ones give pose hints."""
 
 import math
 
@@ -13,11 +13,11 @@ from gigabrain_zenoh.perception.tag_memory import TagMemory, face_yaw
 from tests.unit.perception.test_object_memory import FRONT, NOTHING, WELL
 
 CORNERS = ((100.0, 100.0), (120.0, 100.0), (120.0, 80.0), (100.0, 80.0))
-WALL = np.array((3.0, 0.5, math.pi))  # it hangs there, and looks back
+WALL = np.array((3.0, 0.5, math.pi))  # place of the tag, which faces the robot
 
 
 def tag(pose: Floats, place: Floats = WALL, number: int = 7) -> TagDetection:
-    """A tag at `place` (3,) in the map, as seen from `pose` (3,)."""
+    """Return a detection of a tag at `place` (3,) in the map, from `pose` (3,)."""
     x, y, yaw = compose(inverse(pose), place).tolist()
     return TagDetection(
         id=number, corners=CORNERS, size=0.16, position=(x, y, 0.4),
@@ -57,14 +57,14 @@ def test_a_tag_enters_the_map_with_its_averaged_pose() -> None:
     assert math.cos(one.yaw - math.pi) > 0.998
 
 
-def test_a_robot_that_is_not_sure_of_its_place_teaches_nothing() -> None:
+def test_a_poorly_localized_robot_learns_no_tags() -> None:
     eye = Eye()
     eye.spread = np.diag((0.3, 0.3, 0.05)) ** 2
     eye.look(tag(eye.pose), pictures=20)
     assert eye.tags.tags() == ()
 
 
-def test_a_known_tag_says_where_the_robot_is() -> None:
+def test_a_known_tag_gives_a_pose_hint() -> None:
     eye = Eye()
     eye.look(tag(eye.pose), pictures=5)
     there = np.array((2.0, 1.2, -0.6))
@@ -76,7 +76,7 @@ def test_a_known_tag_says_where_the_robot_is() -> None:
     assert eye.tags.hint([tag(there, number=8)]) is None
 
 
-def test_a_tag_that_was_moved_is_learnt_anew_after_some_seconds() -> None:
+def test_a_moved_tag_is_learnt_again_after_some_seconds() -> None:
     eye, moved = Eye(), np.array((2.5, -1.0, 2.5))
     eye.look(tag(eye.pose), pictures=30)
     eye.look(tag(eye.pose, moved), pictures=25)
@@ -85,16 +85,16 @@ def test_a_tag_that_was_moved_is_learnt_anew_after_some_seconds() -> None:
     assert eye.tags.tags()[0].x == pytest.approx(2.5, abs=0.01)
 
 
-def test_a_robot_that_was_carried_off_does_not_move_its_tags() -> None:
+def test_a_robot_that_was_carried_away_does_not_move_its_tags() -> None:
     eye = Eye()
     eye.look(tag(eye.pose), pictures=30)
     for _ in range(10):
-        eye.look(tag(np.array((5.0, 5.0, 1.0))), pictures=5)  # it still thinks to be at the origin
-        eye.tags.doubt()  # until the scan tells
+        eye.look(tag(np.array((5.0, 5.0, 1.0))), pictures=5)  # its pose is still the origin
+        eye.tags.doubt()  # as the scan shows
     assert eye.tags.tags()[0].x == pytest.approx(3.0, abs=0.01)
 
 
-def test_a_tag_that_was_taken_down_is_forgotten_when_its_place_is_looked_at() -> None:
+def test_a_tag_that_was_removed_is_forgotten_when_its_place_is_seen() -> None:
     eye = Eye()
     eye.pose = np.array((1.6, 0.5, 0.0))
     eye.look(tag(eye.pose), pictures=10)
@@ -107,9 +107,9 @@ def test_a_tag_that_was_taken_down_is_forgotten_when_its_place_is_looked_at() ->
 
 
 def test_a_tag_on_the_floor_and_one_without_an_orientation_have_no_face() -> None:
-    lying = (0.0, -math.sqrt(0.5), 0.0, math.sqrt(0.5))  # its face looks upwards
+    lying = (0.0, -math.sqrt(0.5), 0.0, math.sqrt(0.5))  # it faces upwards
     assert face_yaw(replace_orientation(lying)) is None
-    assert face_yaw(replace_orientation((0.0, 0.0, 0.0, 0.0))) is not None  # as unturned
+    assert face_yaw(replace_orientation((0.0, 0.0, 0.0, 0.0))) is not None  # treated as not rotated
     eye = Eye()
     eye.look(replace_orientation(lying), pictures=9)
     assert eye.tags.tags() == ()
@@ -121,7 +121,7 @@ def replace_orientation(orientation: tuple[float, float, float, float]) -> TagDe
     )
 
 
-def test_hundreds_of_tags_are_bounded_and_keep_what_is_sure() -> None:
+def test_memory_of_tags_is_bounded_and_keeps_confirmed_ones() -> None:
     eye = Eye()
     eye.look(tag(eye.pose), pictures=10)
     for k in range(20):
