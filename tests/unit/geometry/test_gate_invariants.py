@@ -1,6 +1,6 @@
 """Invariants of the gate, tested by hypothesis with events in any order.
 
-The test keeps a record of its own, from the events alone, and compares the gate with it.
+The test keeps its own record, from the events alone, and compares the gate with it.
 """
 
 import math
@@ -20,10 +20,10 @@ from gigabrain_zenoh.geometry.limits import NO_CAPS, ZERO, Limits, clamp
 from tests.unit.gate.rig import BLIND, BOOT, CRASHED, HOT, LIMITS, LOST, ZONE
 
 MS = 1_000_000
-GAIN = (0.02, 0.02, 0.06)  # of speed in a tick, by axis, as LIMITS say
+GAIN = (0.02, 0.02, 0.06)  # maximum gain of speed per tick, by axis, from LIMITS
 LOSS = (0.04, 0.04, 0.06)
 MAX_SPEEDS = (0.26, 0.2, 1.8)
-RIM, HALF_TRACK = 0.266, 0.1435  # [m/s], [m], of a base whose wheels are not as fast as that
+RIM, HALF_TRACK = 0.266, 0.1435  # [m/s], [m], of a base with slower wheels
 ROUNDING = 1e-9
 MOVES = {
     ("latched", "idle"),
@@ -59,7 +59,7 @@ def latching(causes: tuple[Cause, ...]) -> set[str]:
 
 
 class GateMachine(RuleBasedStateMachine):
-    """Whatever may happen to a gate. Every event goes through `feed`, which checks all rules."""
+    """Random events for a gate. Every event goes through `feed`, which checks all rules."""
 
     @initialize(auto_resume=st.booleans(), slow_wheels=st.booleans())
     def boot(self, auto_resume: bool, slow_wheels: bool) -> None:
@@ -69,12 +69,12 @@ class GateMachine(RuleBasedStateMachine):
         self.config = gate.GateConfig(limits=self.limits, auto_resume=auto_resume)
         self.state = gate.GateState(boot=BOOT)
         self.issued_ns = [0]  # by tick
-        self.told = (0.0, 0.0, 0.0)  # what the body was told in the last tick
-        self.opened = 0  # tick in which the present commander was let in
-        self.good: CmdVel | None = None  # its newest good command
-        self.good_tick = 0
+        self.sent = (0.0, 0.0, 0.0)  # velocity sent to the body in the last tick
+        self.enabled_tick = 0  # tick in which the current commander was enabled
+        self.newest_command: CmdVel | None = None  # its newest good command
+        self.newest_command_tick = 0
         self.seq = 0
-        self.said: SafetyState | None = None
+        self.newest_safety: SafetyState | None = None
         self.faults: tuple[Cause, ...] = ()
         self.still = 0
 
@@ -85,7 +85,7 @@ class GateMachine(RuleBasedStateMachine):
         wall_ms=st.sampled_from([20, 20, 20, 25, 75, 150, 151]),
     )
     def tick(self, linear: float, angular: float, faults: tuple[Cause, ...], wall_ms: int) -> None:
-        self.told, self.faults = axes(self.state.output), faults
+        self.sent, self.faults = axes(self.state.output), faults
         self.issued_ns.append(self.issued_ns[-1] + wall_ms * MS)
         self.still = self.still + 1 if linear < 0.01 and abs(angular) < 0.05 else 0
         measured = Velocity(linear_x=linear, angular_z=angular)
@@ -144,11 +144,11 @@ class GateMachine(RuleBasedStateMachine):
         age: int,
     ) -> None:
         tick = max(0, self.state.tick - age)
-        said = SafetyState(verdict=verdict, caps=caps, causes=causes, boot=boot, tick=tick)
-        newest = self.said.tick if self.said else 0
+        state = SafetyState(verdict=verdict, caps=caps, causes=causes, boot=boot, tick=tick)
+        newest = self.newest_safety.tick if self.newest_safety else 0
         if boot == BOOT and newest <= tick <= self.state.tick:
-            self.said = said
-        self.feed(gate.Safety(said))
+            self.newest_safety = state
+        self.feed(gate.Safety(state))
 
     @rule(source=sources, boot=boots, times=st.sampled_from([1, 1, 5]))
     def not_finite(self, source: str, boot: int, times: int) -> None:
@@ -197,7 +197,7 @@ class GateMachine(RuleBasedStateMachine):
         self.all_is_well(13, then_x, then_z)
 
     def send(self, command: CmdVel, wall_ns: int) -> None:
-        before, good = self.state, self.good
+        before, newest = self.state, self.newest_command
         outcome = self.feed(gate.VelocityCommand(command, wall_ns))
         assert outcome.ok == (outcome.refused == "")
         if outcome.refused:
@@ -209,7 +209,7 @@ class GateMachine(RuleBasedStateMachine):
         assert command.boot == BOOT
         assert 0 <= before.tick - command.tick <= 7
         assert wall_ns - self.issued_ns[command.tick] <= 150 * MS
-        assert good is None or command.seq > good.seq
+        assert newest is None or command.seq > newest.seq
         assert command.basis or command.source != "control" or axes(command) == (0.0, 0.0, 0.0)
         assert all(math.isfinite(value) for value in axes(command))
 
@@ -217,23 +217,25 @@ class GateMachine(RuleBasedStateMachine):
         before = self.state
         self.state, outcome = gate.step(self.config, before, event)
         assert gate.step(self.config, before, event) == (self.state, outcome)
-        assert self.state.safety == self.said
-        self.keep_books(before, event, outcome)
+        assert self.state.safety == self.newest_safety
+        self.update_record(before, event, outcome)
         self.check_mode(before, event)
         self.check_causes(before, event)
         self.check_output()
         if self.state.mode == "enabled":
-            self.check_that_it_may_move()
+            self.check_may_move()
         return outcome
 
-    def keep_books(self, before: gate.GateState, event: gate.Event, outcome: gate.Outcome) -> None:
+    def update_record(
+        self, before: gate.GateState, event: gate.Event, outcome: gate.Outcome
+    ) -> None:
         if self.state.commander != before.commander:
-            self.opened, self.good = self.state.tick, None
+            self.enabled_tick, self.newest_command = self.state.tick, None
         if isinstance(event, gate.VelocityCommand) and not outcome.refused:
-            self.good, self.good_tick = event.command, self.state.tick
+            self.newest_command, self.newest_command_tick = event.command, self.state.tick
         theirs = before.commander != "" and outcome.refused == "not_finite"
         if isinstance(event, gate.Estop) or (theirs and self.state != before):
-            self.told = (0.0, 0.0, 0.0)  # these two cut the output at once
+            self.sent = (0.0, 0.0, 0.0)  # these two cut the output at once
 
     def check_mode(self, before: gate.GateState, event: gate.Event) -> None:
         after = self.state
@@ -247,7 +249,7 @@ class GateMachine(RuleBasedStateMachine):
             assert after.mode == "idle"
             assert event.estop_generation == before.estop_generation
             assert not latching(self.faults)
-            assert not self.said or not latching(self.said.causes)
+            assert not self.newest_safety or not latching(self.newest_safety.causes)
         else:
             assert isinstance(event, gate.Tick)
             assert self.config.auto_resume
@@ -265,40 +267,41 @@ class GateMachine(RuleBasedStateMachine):
         assert (self.state.causes != ()) or self.state.mode not in ("latched", "stopping")
 
     def check_output(self) -> None:
-        """Never more than the body can do, nor a faster change; down to zero unless enabled."""
-        calm = self.state.tick - self.opened < 5
-        driven = self.state.mode == "enabled" and self.good is not None and not calm
-        allowed = self.said.caps if self.said else NO_CAPS
+        """Check the limits of speed and its change, and that it falls to zero unless enabled."""
+        starting = self.state.tick - self.enabled_tick < 5
+        driven = self.state.mode == "enabled" and self.newest_command is not None and not starting
+        allowed = self.newest_safety.caps if self.newest_safety else NO_CAPS
         forward = (allowed.forward, allowed.left, allowed.rotation)
         backward = (allowed.backward, allowed.right, allowed.rotation)
         for axis, value in enumerate(axes(self.state.output)):
-            told = self.told[axis]
-            braking = max(0.0, abs(told) - LOSS[axis])
+            sent = self.sent[axis]
+            braking = max(0.0, abs(sent) - LOSS[axis])
             bound = forward[axis] if value > 0 else backward[axis]
             assert abs(value) <= MAX_SPEEDS[axis]
-            assert value * told >= 0  # it never goes through zero
+            assert value * sent >= 0  # it never goes through zero
             assert abs(value) >= braking - ROUNDING
-            assert abs(value) <= (abs(told) + GAIN[axis] if driven else braking) + ROUNDING
+            assert abs(value) <= (abs(sent) + GAIN[axis] if driven else braking) + ROUNDING
             assert bound is None or abs(value) <= max(bound, braking) + ROUNDING
         self.check_last_clamp()
         assert self.state.output == ZERO or self.state.mode in ("enabled", "stopping")
 
     def check_last_clamp(self) -> None:
-        """Check that a driver's second clamp changes nothing, so the steps above are the body's."""
+        """Check that a driver's second clamp changes nothing: the body gets the steps above."""
         clamped = clamp(self.state.output, self.limits)
         for value, kept in zip(axes(self.state.output), axes(clamped), strict=True):
             assert abs(value - kept) <= ROUNDING
 
-    def check_that_it_may_move(self) -> None:
+    def check_may_move(self) -> None:
         now = self.state.tick
         assert not self.faults
-        assert now - (self.good_tick if self.good else self.opened) <= 5
-        assert not self.good or not self.good.basis or now - self.good.basis <= 12
-        assert self.said
-        assert 0 <= now - self.said.tick <= 7
-        assert self.issued_ns[now] - self.issued_ns[self.said.tick] <= 150 * MS
-        assert self.said.verdict != "stop"
-        assert not latching(self.said.causes)
+        command = self.newest_command
+        assert now - (self.newest_command_tick if command else self.enabled_tick) <= 5
+        assert not command or not command.basis or now - command.basis <= 12
+        assert self.newest_safety
+        assert 0 <= now - self.newest_safety.tick <= 7
+        assert self.issued_ns[now] - self.issued_ns[self.newest_safety.tick] <= 150 * MS
+        assert self.newest_safety.verdict != "stop"
+        assert not latching(self.newest_safety.causes)
 
 
 TestGate = GateMachine.TestCase
