@@ -1,4 +1,4 @@
-"""Task execution in memory: an executive on time that the test counts, and the task service."""
+"""Task execution in memory: the task queue and the task server, with time set by the test."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -36,7 +36,7 @@ PLACES = "places: {dock: [0, 0, 1.5], a: [1, 0], b: [2, 0], c: [3, 0]}\n"
 
 
 class Program:
-    """A program of the host that ends when the test says so."""
+    """A program of the host that the test ends by its `result`."""
 
     def __init__(self, script: Script) -> None:
         self.script, self.stopped, self.paused = script, False, False
@@ -53,7 +53,7 @@ class Program:
 
 
 class Robot:
-    """An executive, on time that the test counts, and somebody who drives."""
+    """A task queue with time and outcomes set by the test."""
 
     def __init__(self, saved: Saved | None = None) -> None:
         self.charge, self.programs = 100.0, list[Program]()
@@ -66,18 +66,18 @@ class Robot:
         return self.tasks.add_mission(mission_files.loads(PLACES + text, "m"), "m", how, "ann")
 
     def step(self, seconds: float = 0.1) -> float | str | None:
-        """One step; where the robot is wanted: x of a goal, `explore`, or nowhere."""
+        """Step once; return the x of the goal, the kind of another command, or None."""
         self.command, _ = self.tasks.step(seconds, self.outcome)
         self.outcome = None
         return _short(self.command)
 
     def reached(self) -> float | str | None:
-        """Report that the robot has arrived, and return the result of the next step."""
-        return self._became("done", "it is there")
+        """Report that the robot arrived, and return the result of the next step."""
+        return self._report("done", "it is there")
 
     def failed(self, why: str = "no way") -> float | str | None:
         """Report that the robot cannot arrive, and return the result of the next step."""
-        return self._became("failed", why)
+        return self._report("failed", why)
 
     @property
     def status(self) -> TaskStatus:
@@ -88,7 +88,7 @@ class Robot:
         """Return the state and the reason of the task that ended last."""
         return self.status.done[0].state, self.status.done[0].reason
 
-    def _became(self, state: Any, reason: str) -> float | str | None:
+    def _report(self, state: Any, reason: str) -> float | str | None:
         assert self.command
         self.outcome = StepOutcome(number=self.command.number, state=state, reason=reason)
         return self.step()
@@ -109,14 +109,14 @@ def _short(command: DriveCommand | None) -> float | str | None:
 
 @contextmanager
 def one_robot() -> Iterator[Robot]:
-    """A robot none of whose programs outlives the test."""
+    """Yield a robot, and check that all its programs are stopped at the end."""
     made = Robot()
     yield made
     assert all(program.stopped for program in made.programs)
 
 
 class Site:
-    """A service of tasks, somebody who drives, and somebody who asks."""
+    """A task server on a bus, with a client and outcomes set by the test."""
 
     def __init__(self, folder: Path, *, scripts: str = "") -> None:
         self.net = Net()

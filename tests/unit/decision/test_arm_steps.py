@@ -87,13 +87,13 @@ def test_wrong_steps_are_refused_with_their_line(text: str, why: str) -> None:
         (Gripper(2.0), "gripper: expected -0.174533 to 1.74533, got 2"),
     ],
 )
-def test_what_the_joints_cannot_do_is_refused(action: ArmAction, why: str) -> None:
+def test_positions_beyond_the_joint_limits_are_refused(action: ArmAction, why: str) -> None:
     with pytest.raises(GigabrainError) as refused:
         arm_steps.check(ARM, [action])
     assert why in str(refused.value)
 
 
-def test_a_body_without_an_arm_refuses_all() -> None:
+def test_a_body_without_an_arm_refuses_all_actions() -> None:
     with pytest.raises(GigabrainError, match="turtlebot3_burger has no arm"):
         arm_steps.check(BASE, [Reach(at=(0.2, 0.0, 0.1))])
 

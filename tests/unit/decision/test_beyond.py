@@ -15,7 +15,7 @@ def small() -> OccupancyGrid:
     )
 
 
-def test_a_map_that_holds_the_goal_stays_as_it_is() -> None:
+def test_a_map_that_contains_the_goal_is_unchanged() -> None:
     grid = small()
     assert enlarged(grid, Goal(x=0.9, y=0.4)) is grid
 
@@ -30,7 +30,7 @@ def test_a_map_that_holds_the_goal_stays_as_it_is() -> None:
         ((1.0, 0.0), (8, 2), (-1.0, -0.5)),
     ],
 )
-def test_it_grows_towards_the_goal_and_two_metres_on(
+def test_the_map_grows_to_two_metres_beyond_the_goal(
     goal: tuple[float, float], size: tuple[int, int], corner: tuple[float, float]
 ) -> None:
     wide = enlarged(small(), Goal(x=goal[0], y=goal[1]))
@@ -38,14 +38,14 @@ def test_it_grows_towards_the_goal_and_two_metres_on(
     assert (wide.origin_x, wide.origin_y) == corner
 
 
-def test_what_was_known_stays_in_its_place_and_all_else_is_unknown() -> None:
+def test_known_cells_keep_their_places_and_new_cells_are_unknown() -> None:
     wide = enlarged(small(), Goal(x=-1.5, y=-1.0))
     assert wide.array()[5:7, 5:].tolist() == small().array().tolist()
     assert (wide.array()[:5] == -1).all()
     assert (wide.array()[:, :5] == -1).all()
 
 
-def test_no_map_is_made_for_a_goal_too_far_off() -> None:
+def test_the_map_does_not_grow_for_a_goal_too_far_away() -> None:
     grid = small()
     assert enlarged(grid, Goal(x=1e6, y=1e6)) is grid
     assert enlarged(grid, Goal(x=1e9, y=0.0)) is grid

@@ -1,4 +1,4 @@
-"""Requests of a body that is to stand before a thing, or that safety stops for no known reason."""
+"""Requests of a body right before a thing, or stopped by safety for an unknown reason."""
 
 import math
 
@@ -15,7 +15,7 @@ from gigabrain_zenoh.navigation.local_planner import LocalPlan, PlanRequest, no_
 from tests.unit.navigation.drives import WAFFLE, Drive
 
 LEKIWI = load_robot("lekiwi").description()
-GHOST = np.array((0.29, 0.02))  # where safety still believes in a can
+GHOST = np.array((0.29, 0.02))  # place where safety remembers a can that is gone
 
 
 def request(away: float, max_speed: float | None = None) -> PlanRequest:
@@ -29,14 +29,14 @@ def request(away: float, max_speed: float | None = None) -> PlanRequest:
     )
 
 
-def test_it_stands_exactly_and_drives_freely_until_it_is_near() -> None:
+def test_it_stops_exactly_and_slows_down_only_near_the_goal() -> None:
     asked = close_up(request(0.4), LEKIWI)
     assert (asked.tolerance, asked.max_speed) == (EXACT_M, None)
     assert close_up(request(0.4, 0.12), LEKIWI).max_speed == 0.12
 
 
 @pytest.mark.parametrize("margin", [0.05, 0.08, 0.2])
-def test_near_by_safety_stops_it_no_sooner_than_where_it_should_stand(margin: float) -> None:
+def test_safety_does_not_stop_it_before_the_goal(margin: float) -> None:
     body = replace(LEKIWI, thresholds=replace(LEKIWI.thresholds, stop_margin=margin))
     slow = close_up(request(0.2), body).max_speed
     assert slow
@@ -44,12 +44,12 @@ def test_near_by_safety_stops_it_no_sooner_than_where_it_should_stand(margin: fl
     assert brakes(body)["forward"].distance(slow) < margin + EXACT_M / 2
 
 
-def test_a_speed_zone_holds_as_well() -> None:
+def test_a_speed_zone_applies_as_well() -> None:
     assert close_up(request(0.2, 0.03), LEKIWI).max_speed == 0.03
 
 
 class Stopped(Drive):
-    """Safety stops it for a ghost ahead, and forgets that once a camera sees the place again."""
+    """Safety stops the body for a ghost ahead, until a camera sees the place again."""
 
     ghost, bars = True, True
 
@@ -70,7 +70,7 @@ class Stopped(Drive):
     @property
     def stops(self) -> bool:
         ahead, aside = self._here(GHOST)
-        self.ghost = self.ghost and ahead < 0.36  # a camera sees the floor from there on
+        self.ghost = self.ghost and ahead < 0.36  # a camera sees the floor beyond 0.36 m
         return self.ghost and ahead > 0.0 and abs(aside) < 0.18
 
     def _here(self, point: np.ndarray) -> tuple[float, float]:
@@ -80,7 +80,7 @@ class Stopped(Drive):
 
 
 @pytest.mark.long
-def test_a_body_that_safety_stops_for_a_ghost_turns_away_and_goes_on() -> None:
+def test_a_body_that_safety_stops_for_a_ghost_turns_away_and_continues() -> None:
     drive = Stopped(WAFFLE, Goal(x=1.0, y=0.0), np.empty((0, 2)))
     drive.bars = False
     assert not drive.go(20.0).arrived

@@ -34,7 +34,7 @@ def square(x: float, y: float, half: float = 0.1, **more: Any) -> Contour:
     ("contour", "ahead"),
     [
         (square(0.6, 0.0), True),  # in the cone
-        (square(0.4, 0.2), True),  # in the strip that it needs to turn
+        (square(0.4, 0.2), True),  # in the strip that the body needs to turn
         (square(1.4, 0.0), False),
         (square(0.0, 1.0), False),
         (square(-0.6, 0.0), False),
@@ -52,7 +52,7 @@ def test_the_nearer_of_scan_and_contours_counts() -> None:
     assert with_contours(world, SEEING).distance_ahead == pytest.approx(0.5, abs=0.01)
 
 
-def test_sectors_have_the_contours_too() -> None:
+def test_sectors_include_contours() -> None:
     found = with_contours(replace(FREE, contours=(square(0.0, 1.0),)), SEEING).sectors
     assert found[3] == pytest.approx(0.9, abs=0.01)
     assert found[9] is None
@@ -81,12 +81,12 @@ async def decided(*contours: Contour) -> tuple[str, int]:
         return intent.reason.partition(" ")[0], node.bus.counters[REFUSED]
 
 
-async def test_avoid_turns_away_from_what_only_a_camera_sees() -> None:
+async def test_avoid_turns_away_from_an_obstacle_that_only_a_camera_sees() -> None:
     assert await decided() == ("forward", 0)
     assert await decided(square(0.6, 0.0)) == ("turning", 0)
 
 
-async def test_what_hangs_higher_than_the_body_does_not_bar_the_way() -> None:
+async def test_a_contour_above_the_body_does_not_block_the_way() -> None:
     assert await decided(square(0.6, 0.0, bottom=0.15)) == ("turning", 0)
     assert await decided(square(0.6, 0.0, bottom=0.25)) == ("forward", 0)
 
@@ -118,13 +118,13 @@ def route(planner: RoutePlanner, tick: int, *contours: np.ndarray) -> list[list[
     return found.points.tolist()
 
 
-def test_a_route_leads_round_contours_and_back_once_they_are_gone() -> None:
+def test_a_route_leads_around_contours_until_they_are_gone() -> None:
     planner = RoutePlanner()
     assert max(y for _, y in route(planner, 1)) < 1.1
     assert max(y for _, y in route(planner, 26, BARRIER)) > 3.1
     assert max(y for _, y in route(planner, 60 * 50 + 27)) < 1.1
 
 
-def test_a_route_without_contours_is_the_same_as_ever() -> None:
+def test_routes_without_contours_are_reproducible() -> None:
     one, other = RoutePlanner(), RoutePlanner()
     assert [route(one, tick) for tick in (1, 26)] == [route(other, tick) for tick in (1, 26)]

@@ -1,4 +1,4 @@
-"""Decision: what it wants, in words and in numbers, and when it says so."""
+"""The behaviour avoid: its twists, reasons, expected trajectories and progress."""
 
 import math
 from dataclasses import replace
@@ -27,7 +27,7 @@ def at(world: WorldModel | None, x: float = 0.0, y: float = 0.0, yaw: float = 0.
     return Inputs(world=world, pose=Pose(x=x, y=y, yaw=yaw))
 
 
-def test_it_drives_straight_on_where_nothing_is_ahead() -> None:
+def test_it_drives_straight_while_nothing_is_ahead() -> None:
     intent = Avoid(CONFIG).step(at(free()))[0]
     assert intent.twist == Velocity(linear_x=0.2)
     assert (intent.behaviour, intent.reason) == ("avoid", "forward 0.20 m/s")
@@ -45,7 +45,7 @@ def test_an_obstacle_at_an_unknown_distance_is_named_without_one() -> None:
     assert Avoid(CONFIG).step(at(blocked(None)))[0].reason == "turning right: obstacle"
 
 
-def test_it_rests_while_the_battery_is_nearly_empty_and_says_why() -> None:
+def test_it_rests_with_a_reason_while_the_battery_is_nearly_empty() -> None:
     avoid = Avoid(CONFIG)
     for world in (free(), blocked(0.5), None):
         intent = avoid.step(replace(at(world), must_charge=True))[0]
@@ -70,7 +70,7 @@ LEFT_CLEAR = (0.8, 3.0, 3.0, 1.0, 1.0, 1.0)  # counter-clockwise: ahead, two lef
     [
         (LEFT_CLEAR, "turning left"),
         ((0.8, 1.0, 1.0, 1.0, 3.0, 3.0), "turning right"),
-        ((0.8, 1.0, 1.0, 3.0, 1.0, 1.0), "turning right"),  # no difference: as usual
+        ((0.8, 1.0, 1.0, 3.0, 1.0, 1.0), "turning right"),  # no difference: the default
         ((0.8, None, 1.0, 1.0, 2.0, 1.0), "turning left"),  # nothing in sight is clearer
         ((0.8, None, None, 1.0, 2.5, 3.4), "turning right"),  # beyond 2.5 m all is open
         ((0.8, 1.0, 2.0, 1.0, 1.0), "turning left"),  # an odd number has no sector behind
@@ -82,7 +82,7 @@ def test_turning_to_the_clearer_side(sectors: tuple[float | None, ...], reason: 
     assert intent.reason.startswith(reason)
 
 
-def test_a_turn_once_begun_keeps_its_side() -> None:
+def test_a_turn_in_progress_keeps_its_side() -> None:
     avoid = Avoid(AvoidConfig(turn="clearer"))
     avoid.step(at(blocked(0.8, *LEFT_CLEAR)))[0]
     later = avoid.step(at(blocked(0.9, 0.9, 1.0, 1.0, 1.0, 3.0, 3.0), yaw=0.4))[0]
@@ -131,27 +131,27 @@ def test_the_expected_trajectory_of_a_bend_is_an_arc_of_radius_v_over_w() -> Non
     assert nearly_straight.y == 0.0
 
 
-def test_progress_of_a_leg_is_what_is_driven_of_what_was_free() -> None:
+def test_progress_of_a_leg_is_the_driven_share_of_the_free_distance() -> None:
     avoid = Avoid(CONFIG)
     at_x = [avoid.step(at(free(2.0), x=x))[0].progress for x in (0.0, 0.5, 1.0, 2.0, 3.0)]
     assert at_x == [0.0, 0.25, 0.5, 1.0, 1.0]
 
 
-def test_a_leg_with_nothing_in_sight_is_expected_to_go_two_and_a_half_metres() -> None:
+def test_a_leg_without_obstacles_in_sight_is_expected_to_be_2_5_m_long() -> None:
     for world in (free(), free(None, 1.0, 1.0, 1.0)):
         avoid = Avoid(CONFIG)
         avoid.step(at(world))[0]
         assert avoid.step(at(world, y=1.25))[0].progress == pytest.approx(0.5)
 
 
-def test_progress_of_a_turn_is_what_is_turned_of_a_right_angle() -> None:
+def test_progress_of_a_turn_is_a_share_of_a_right_angle() -> None:
     avoid = Avoid(CONFIG)
-    yaws = [0.0, -math.pi / 4, -math.pi / 2, -3.0, 3.0, 0.0]  # once round, through the seam
+    yaws = [0.0, -math.pi / 4, -math.pi / 2, -3.0, 3.0, 0.0]  # a full turn, through ±pi
     found = [avoid.step(at(blocked(0.8), yaw=yaw))[0].progress for yaw in yaws]
     assert found == [0.0, pytest.approx(0.5), 1.0, 1.0, 1.0, 1.0]
 
 
-def test_progress_never_goes_back_within_a_step_and_begins_anew_with_the_next() -> None:
+def test_progress_never_decreases_within_a_step_and_restarts_with_the_next() -> None:
     avoid = Avoid(CONFIG)
     pushed = [avoid.step(at(free(1.0), x=x))[0].progress for x in (0.0, 0.5, 0.4, 0.6)]
     assert pushed == [0.0, 0.5, 0.5, pytest.approx(0.6)]
@@ -159,7 +159,7 @@ def test_progress_never_goes_back_within_a_step_and_begins_anew_with_the_next() 
     assert avoid.step(at(free(1.0), x=0.6))[0].progress == 0.0
 
 
-def test_an_unknown_behaviour_suggests_the_nearest() -> None:
+def test_an_unknown_behaviour_suggests_a_similar_name() -> None:
     with pytest.raises(UnknownName, match=r"no behaviour 'aviod'; did you mean 'avoid'\? known"):
         behaviours.load("aviod")
     assert behaviours.load("avoid") is Avoid

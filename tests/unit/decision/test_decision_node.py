@@ -1,4 +1,4 @@
-"""Decision as a process: when it says what, and on which scan that rests."""
+"""Decision as a process: when it publishes intents, and their basis."""
 
 import functools
 import logging
@@ -40,7 +40,7 @@ def heads(intents: list[Intent]) -> list[tuple[int, int, str]]:
     return [(i.tick, i.basis, i.reason.partition(" ")[0]) for i in intents]
 
 
-async def test_a_world_becomes_an_intent_at_once() -> None:
+async def test_a_world_model_leads_to_an_intent_at_once() -> None:
     async with bench() as node:
         node.send(STATE, state(10))
         assert heads(node.sent(INTENT)) == [(10, 0, "waiting:")]
@@ -65,7 +65,7 @@ async def test_an_intent_is_repeated_with_the_newest_tick_and_its_own_basis() ->
         assert heads(node.sent(INTENT)) == [(15, 10, "forward"), (15, 15, "turning")]
 
 
-async def test_a_world_that_comes_before_the_state_of_its_tick_waits_for_it() -> None:
+async def test_a_world_model_that_arrives_before_the_state_of_its_tick_waits_for_it() -> None:
     async with bench() as node:
         node.send(STATE, state(9))
         node.sent(INTENT)
@@ -75,7 +75,7 @@ async def test_a_world_that_comes_before_the_state_of_its_tick_waits_for_it() ->
         assert heads(node.sent(INTENT)) == [(10, 10, "forward")]
 
 
-async def test_a_state_that_was_overtaken_by_a_later_world_does_not_use_it() -> None:
+async def test_a_state_does_not_use_a_later_world_model() -> None:
     async with bench() as node:
         node.send(STATE, state(8))
         node.send(WORLD, world(10))
@@ -84,18 +84,18 @@ async def test_a_state_that_was_overtaken_by_a_later_world_does_not_use_it() -> 
         assert heads(node.sent(INTENT)) == [(9, 0, "waiting:")]
 
 
-async def test_it_thinks_once_per_world_however_often_it_repeats_itself() -> None:
+async def test_it_steps_once_per_world_model_and_repeats_the_intent() -> None:
     async with bench() as node:
         node.send(STATE, state(10))
         node.send(WORLD, world(10))
         node.send(STATE, state(11, pose=(1.0, 0.0, 0.0)))
-        node.send(WORLD, world(10))  # the same once more
+        node.send(WORLD, world(10))  # the same again
         intents = node.sent(INTENT)
     assert [intent.progress for intent in intents] == [0.0, 0.0, 0.0, 0.0]
 
 
 @pytest.mark.parametrize(("rate_hz", "last"), [(10.0, 22), (5.0, 25)])
-async def test_it_waits_once_the_world_is_older_than_250_ms_or_one_and_a_half_scans(
+async def test_it_waits_once_the_world_model_is_older_than_250_ms_or_1_5_scans(
     rate_hz: float, last: int
 ) -> None:
     async with bench() as node:
@@ -111,7 +111,7 @@ async def test_it_waits_once_the_world_is_older_than_250_ms_or_one_and_a_half_sc
     assert intents[-1].basis == 10
 
 
-async def test_a_driver_that_starts_anew_is_met_with_an_open_mind() -> None:
+async def test_a_restart_of_the_driver_resets_the_behaviour() -> None:
     async with bench() as node:
         node.send(STATE, state(5000))
         node.send(WORLD, world(5000))
@@ -125,7 +125,7 @@ async def test_a_driver_that_starts_anew_is_met_with_an_open_mind() -> None:
     assert intents[-1].progress == 0.0
 
 
-async def test_a_change_of_mind_is_logged_once(caplog: pytest.LogCaptureFixture) -> None:
+async def test_a_change_of_activity_is_logged_once(caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.INFO, "gigabrain_zenoh.decision.node")
     async with bench() as node:
         for tick in range(10, 30, 5):
@@ -138,7 +138,7 @@ async def test_a_change_of_mind_is_logged_once(caplog: pytest.LogCaptureFixture)
     ]
 
 
-async def test_for_an_arm_that_is_fixed_it_idles_with_a_reason_and_waits_for_no_world() -> None:
+async def test_it_idles_with_a_reason_for_a_fixed_arm_without_a_world_model() -> None:
     async with bench() as node:
         node.send(BODY, Body(description=arm_body(), link="sim", boot=7, tick=9))
         node.send(STATE, state(10))
@@ -149,23 +149,23 @@ async def test_for_an_arm_that_is_fixed_it_idles_with_a_reason_and_waits_for_no_
     assert {(intent.twist, intent.joints) for intent in found} == {(None, ())}
 
 
-async def test_without_a_state_it_says_nothing() -> None:
+async def test_it_publishes_nothing_without_a_state() -> None:
     async with bench() as node:
         node.send(WORLD, world(10))
         assert node.sent(INTENT) == []
         node.send(STATE, state(10))
         node.sent(INTENT)
-        await node.clock.advance(260_000_000)  # the driver has stopped
+        await node.clock.advance(260_000_000)  # the driver stopped
         node.send(WORLD, world(10))
         assert node.sent(INTENT) == []
 
 
-async def test_an_unknown_behaviour_ends_the_process_before_it_begins() -> None:
+async def test_an_unknown_behaviour_raises_before_the_process_starts() -> None:
     with pytest.raises(UnknownName, match="no behaviour 'fly'"):
         await decision.run(DecisionConfig(behaviour="fly"), None, lambda: None)  # type: ignore[arg-type]
 
 
-async def test_it_comes_to_rest_when_safety_warns_of_an_empty_battery() -> None:
+async def test_it_rests_when_safety_warns_of_an_empty_battery() -> None:
     low = Cause(code="battery_return", text="battery at 6 %")
     async with NodeBench(functools.partial(decision.run, CONFIG)) as bench:
         bench.send(BODY, body())
@@ -177,5 +177,5 @@ async def test_it_comes_to_rest_when_safety_warns_of_an_empty_battery() -> None:
             verdict = SafetyState(verdict="ok", warnings=warnings, boot=7, tick=tick)
             bench.send(SAFETY, verdict)
             found.append(bench.sent(INTENT)[-1].reason.partition(":")[0])
-    # what is said within a tick counts from the next
+    # a verdict applies from the next tick on
     assert found == ["forward 0.20 m/s", "forward 0.20 m/s", "resting", "resting"]

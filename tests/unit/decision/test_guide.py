@@ -1,4 +1,4 @@
-"""From an order to a route, as the map changes under way."""
+"""Routes for commands while the map and people change."""
 
 import functools
 import math
@@ -26,10 +26,10 @@ from tests.unit.navigation.grids import empty, grid_of
 
 OPEN = empty(6.0, 2.0)
 SHUT = OPEN.copy()
-SHUT[:, 30] = 100  # a wall right across at x = 3 m
+SHUT[:, 30] = 100  # a wall across at x = 3 m
 ROOM = empty(8.0, 6.0)
 TAKEN = ROOM.copy()
-TAKEN[28:32, 48:52] = 100  # somebody, round (5, 3)
+TAKEN[28:32, 48:52] = 100  # a person, around (5, 3)
 AHEAD = Goal(x=5.0, y=1.0)
 NOBODY, NOTHING = np.empty((0, 3)), np.empty((0, 2))
 
@@ -64,7 +64,7 @@ def think(
     )
 
 
-def test_a_way_that_the_map_loses_is_kept_to_for_thirty_seconds() -> None:
+def test_a_path_that_the_map_closes_is_followed_for_30_s() -> None:
     guide = RoutePlanner()
     first = think(guide, OPEN, tick=1)
     assert first.points is not None
@@ -78,7 +78,7 @@ def test_a_way_that_the_map_loses_is_kept_to_for_thirty_seconds() -> None:
     assert lost.reason.startswith("no way leads to the goal; nearest reachable point is ")
 
 
-def test_a_way_that_somebody_bars_at_first_has_thirty_seconds_to_open() -> None:
+def test_a_path_blocked_by_a_person_at_first_has_30_s_to_open() -> None:
     guide = RoutePlanner()
     barred = think(guide, SHUT, tick=1)
     assert barred.state == "running"
@@ -92,7 +92,7 @@ def test_a_way_that_somebody_bars_at_first_has_thirty_seconds_to_open() -> None:
     assert ends == ["running", "running", "failed"]
 
 
-def test_a_way_that_opens_again_is_planned_anew() -> None:
+def test_a_path_that_opens_again_is_replanned() -> None:
     guide = RoutePlanner()
     think(guide, OPEN, tick=1)
     think(guide, SHUT, tick=50, x=2.0)
@@ -103,10 +103,10 @@ def test_a_way_that_opens_again_is_planned_anew() -> None:
     assert kept.state == "running"
 
 
-def test_a_detour_has_its_own_time_and_going_to_and_fro_ends() -> None:
+def test_a_detour_restarts_the_timer_but_driving_back_and_forth_ends() -> None:
     guide = RoutePlanner()
     barred = ROOM.copy()
-    barred[10:, 40] = 100  # a wall at x = 4 m, round which the way is over 5 m longer
+    barred[10:, 40] = 100  # a wall at x = 4 m; the way around it is over 5 m longer
     ask = functools.partial(think, guide, goal=Goal(x=7.0, y=4.5), y=4.5)
     assert ask(ROOM, tick=1, x=3.0).state == "running"
     ends = [ask(barred, tick=1001, x=3.5)]
@@ -116,22 +116,22 @@ def test_a_detour_has_its_own_time_and_going_to_and_fro_ends() -> None:
     assert tries == ["running"] * 8 + ["failed"] * 4
 
 
-def test_who_had_to_give_way_at_the_goal_has_time_to_settle_there_again() -> None:
+def test_a_robot_that_gave_way_at_the_goal_has_time_to_return() -> None:
     guide = RoutePlanner()
     ask = functools.partial(think, guide, OPEN, goal=AHEAD)
     assert ask(tick=1).state == "running"
     assert ask(tick=1000, x=5.0).state == "running"
-    assert ask(tick=1100, x=4.4).state == "running"  # for who comes along
+    assert ask(tick=1100, x=4.4).state == "running"  # it gave way
     tries = [ask(tick=2400 + 700 * k, x=5.0).state for k in range(3)]
     assert tries == ["running", "running", "running"]
-    assert ask(tick=3901, x=5.0).state == "failed"  # it was there for 30 s and has not arrived
+    assert ask(tick=3901, x=5.0).state == "failed"  # 30 s at the goal without an arrival
 
 
-def test_who_comes_no_nearer_than_a_hand_settles_there_and_says_so() -> None:
+def test_a_robot_stuck_near_the_goal_accepts_its_place_with_a_reason() -> None:
     guide = RoutePlanner()
     goal = Goal(x=5.0, y=1.0, yaw=1.5)
     ask = functools.partial(think, guide, OPEN, goal=goal)
-    for tick in (1, 1501):  # safety sees something right ahead that is not in the map
+    for tick in (1, 1501):  # safety stops it for an obstacle that is not in the map
         assert ask(tick=tick, x=4.85).goal == goal
     settled = ask(tick=1502, x=4.85)
     assert settled.goal == Goal(x=4.85, y=1.0, yaw=1.5)
@@ -143,7 +143,7 @@ def test_who_comes_no_nearer_than_a_hand_settles_there_and_says_so() -> None:
     assert ask(tick=3003, x=4.86).state == "failed"
 
 
-def test_going_to_and_fro_at_the_goal_ends() -> None:
+def test_driving_back_and_forth_at_the_goal_ends() -> None:
     guide = RoutePlanner()
     ends = [think(guide, OPEN, tick=1 + 1000 * k, x=5.0 if k % 2 else 4.8) for k in range(8)]
     assert [one.state for one in ends] == ["running"] * 7 + ["failed"]
@@ -155,22 +155,22 @@ def test_the_time_in_which_the_robot_is_held_does_not_count() -> None:
     ask = functools.partial(think, guide, OPEN, x=2.0)
     ask(tick=1)
     assert ask(tick=1001).state == "running"
-    assert ask(tick=9001, held_ticks=7700).state == "running"  # 300 ticks of it were driven
+    assert ask(tick=9001, held_ticks=7700).state == "running"  # it was free to drive for 300 ticks
     assert ask(tick=9201).state == "running"
     assert ask(tick=9202).state == "failed"
 
 
-def test_a_robot_that_was_driven_away_meanwhile_has_to_come_nearer_than_there() -> None:
+def test_a_robot_that_an_operator_drove_away_makes_progress_from_there() -> None:
     guide = RoutePlanner()
     think(guide, OPEN, tick=1, x=4.0)
-    for step in range(20):  # an operator drives it back, 10 cm in a look
+    for step in range(20):  # an operator drives it back, 10 cm per plan
         held = think(guide, OPEN, tick=26 + 25 * step, x=4.0 - 0.1 * step, held_ticks=25)
         assert held.state == "running"
     back = [think(guide, OPEN, tick=501 + 500 * k, x=2.1 + 0.5 * k) for k in range(1, 5)]
     assert [one.state for one in back] == ["running"] * 4
 
 
-def test_it_gives_up_with_what_is_known_of_why() -> None:
+def test_it_gives_up_with_the_known_reason() -> None:
     def ended(**known: Any) -> str:
         guide = RoutePlanner()
         think(guide, OPEN, tick=1, x=2.0)
@@ -186,7 +186,7 @@ def test_it_gives_up_with_what_is_known_of_why() -> None:
     assert ended(feedback=doing, slowed_by=near) == f"{gave_up} ({near})"
 
 
-def test_a_goal_within_the_arrival_tolerance_of_a_reachable_place_is_driven_to() -> None:
+def test_it_drives_to_a_goal_within_the_arrival_tolerance_of_a_reachable_place() -> None:
     too_near = Goal(x=2.88, y=1.05)  # the nearest cell with room is at 2.75 m
     refused = RoutePlanner().check(grid_of(SHUT), WAFFLE, Pose(x=1.0, y=1.0, yaw=0.0), too_near)
     assert isinstance(refused, Unreachable)
@@ -203,11 +203,11 @@ def test_a_goal_within_the_arrival_tolerance_of_a_reachable_place_is_driven_to()
     assert route.reason.startswith("0.08 m from the requested goal: the goal is too close to ")
 
 
-def test_what_is_inside_something_from_the_first_is_refused_at_once() -> None:
+def test_a_goal_that_is_occupied_from_the_start_fails_at_once() -> None:
     assert think(RoutePlanner(), SHUT, tick=1, goal=Goal(x=3.0, y=1.0)).state == "failed"
 
 
-def test_it_makes_room_when_somebody_stays_where_it_is_to_go() -> None:
+def test_it_gives_way_to_a_person_who_stays_at_the_goal() -> None:
     guide = RoutePlanner()
     goal = Goal(x=5.0, y=3.0)
     ask = functools.partial(think, guide, goal=goal, x=4.0, y=3.0)
@@ -219,7 +219,7 @@ def test_it_makes_room_when_somebody_stays_where_it_is_to_go() -> None:
     assert (leaves.activity, leaves.reason) == ("giving way", "the goal is occupied")
     assert leaves.version != waits.version
     assert leaves.goal
-    assert abs(leaves.goal.y - 3.0) >= 1.0  # beside the line on which the other is likely to go on
+    assert abs(leaves.goal.y - 3.0) >= 1.0  # beside the line on which the person walks
     assert math.hypot(leaves.goal.x - 4.0, leaves.goal.y - 3.0) < 1.5
     stays = ask(TAKEN, tick=1251, x=leaves.goal.x, y=leaves.goal.y)
     assert (stays.activity, stays.goal, stays.version) == (
@@ -232,7 +232,7 @@ def test_it_makes_room_when_somebody_stays_where_it_is_to_go() -> None:
     assert goes.version != leaves.version
 
 
-def test_what_stays_at_the_goal_for_ever_is_made_room_for_twice_and_then_reported() -> None:
+def test_it_gives_way_twice_to_an_obstacle_that_stays_at_the_goal_and_then_fails() -> None:
     guide = RoutePlanner()
     ask = functools.partial(think, guide, goal=Goal(x=5.0, y=3.0), x=4.0, y=3.0)
     ask(ROOM, tick=1)
@@ -242,14 +242,14 @@ def test_what_stays_at_the_goal_for_ever_is_made_room_for_twice_and_then_reporte
     away, look = "giving way", "checking whether the goal is free"
     assert told == [away, away, look, look, away, away, look, look]
     assert routes[4].goal
-    assert math.hypot(routes[4].goal.x - 5.0, routes[4].goal.y - 3.0) > 4.0  # far, the second time
+    assert math.hypot(routes[4].goal.x - 5.0, routes[4].goal.y - 3.0) > 4.0  # now far away
     told = ask(TAKEN, tick=4004)
     assert told.state == "failed"
     assert told.reason.startswith("the goal is inside something; nearest reachable point is ")
 
 
-def test_who_stood_aside_comes_back_to_look_whether_there_is_room_again() -> None:
-    """The map keeps whoever has gone meanwhile, where the robot cannot see it from aside."""
+def test_it_returns_after_giving_way_to_check_if_the_goal_is_free() -> None:
+    """The map keeps a person who left, as the robot cannot see that from its place aside."""
     guide = RoutePlanner()
     goal = Goal(x=5.0, y=3.0)
     ask = functools.partial(think, guide, goal=goal)
@@ -260,15 +260,15 @@ def test_who_stood_aside_comes_back_to_look_whether_there_is_room_again() -> Non
     assert looks.reason == "the goal is inside something"
     assert looks.goal
     assert looks.points is not None
-    assert looks.activity  # to be there is not to have arrived
+    assert looks.activity  # the command is not done there
     assert 0.2 < math.hypot(looks.goal.x - 5.0, looks.goal.y - 3.0) < 0.8
     back = ask(ROOM, tick=1400, x=looks.goal.x, y=looks.goal.y)
     assert (back.goal, back.activity, back.reason) == (goal, "", "")
 
 
-def test_it_makes_room_for_who_keeps_it_from_the_place_beside_its_goal() -> None:
+def test_it_gives_way_to_a_person_at_the_place_beside_its_goal() -> None:
     taken = ROOM.copy()
-    taken[28:32, 50:54] = 100  # the goal is too close to it, and what is 0.1 m beside is not
+    taken[28:32, 50:54] = 100  # too close to the goal, but not to a place 0.1 m beside it
     guide = RoutePlanner()
     ask = functools.partial(think, guide, goal=Goal(x=4.85, y=3.0), x=4.0, y=3.0)
     ask(ROOM, tick=1)
@@ -278,7 +278,7 @@ def test_it_makes_room_for_who_keeps_it_from_the_place_beside_its_goal() -> None
     assert ask(taken, tick=502).activity
 
 
-def test_a_robot_between_walls_goes_far_from_who_stands_at_its_goal() -> None:
+def test_a_robot_between_walls_drives_far_from_a_person_at_its_goal() -> None:
     aisle = empty(8.0, 1.0)
     taken = aisle.copy()
     taken[3:7, 48:52] = 100
@@ -296,15 +296,15 @@ OPENED = ROOM.copy()
 OPENED[:, 40:42] = 100  # a wall at x = 4 m, with a door
 OPENED[24:36, 40:42] = 0
 BARRED = OPENED.copy()
-BARRED[28:32, 38:43] = 100  # somebody stands in it
-THERE = np.array([[4.05, 3.0, math.pi]])  # they came through it towards -x
+BARRED[28:32, 38:43] = 100  # a person stands in it
+THERE = np.array([[4.05, 3.0, math.pi]])  # a person who came through it towards -x
 
 
 HITS = np.array([[3.8, 3.1], [3.8, 2.9]])  # of their front
 
 
 def goes_aside(cells: np.ndarray, walkers: np.ndarray, seen: np.ndarray) -> list[Route]:
-    """Return the routes of a robot that stands before the door."""
+    """Return the routes of a robot in front of the door."""
     guide = RoutePlanner()
     ask = functools.partial(think, guide, goal=Goal(x=6.0, y=3.0), x=3.2, y=3.2)
     ask(OPENED, tick=1)
@@ -312,31 +312,31 @@ def goes_aside(cells: np.ndarray, walkers: np.ndarray, seen: np.ndarray) -> list
     return [ask(cells, tick=tick, walkers=walkers, seen=seen) for tick in ticks]
 
 
-@pytest.mark.parametrize("cells", [BARRED, OPENED])  # the map knows them sooner or later
-def test_it_goes_aside_for_somebody_in_the_only_door(cells: np.ndarray) -> None:
+@pytest.mark.parametrize("cells", [BARRED, OPENED])  # with and without the person in the map
+def test_it_moves_aside_for_a_person_in_the_only_door(cells: np.ndarray) -> None:
     *waits, leaves, stays = goes_aside(cells, THERE, HITS)
     assert [one.activity for one in waits] == ["", ""]
     assert (leaves.activity, leaves.reason) == ("giving way", "somebody is in the way")
     assert leaves.goal
-    assert abs(leaves.goal.y - 3.0) >= 1.0  # beside their line, not beside its own to them
+    assert abs(leaves.goal.y - 3.0) >= 1.0  # beside the line of the person, not of the robot
     assert math.dist((leaves.goal.x, leaves.goal.y), (3.2, 3.2)) < 1.2
     assert (stays.goal, stays.activity) == (leaves.goal, leaves.activity)
 
 
-def test_it_goes_on_as_soon_as_they_have_walked_on() -> None:
+def test_it_continues_as_soon_as_the_person_walks_on() -> None:
     guide = RoutePlanner()
     ask = functools.partial(think, guide, goal=Goal(x=6.0, y=3.0), x=3.2, y=3.2)
     ask(OPENED, tick=1)
     aside = ask(BARRED, tick=252, walkers=THERE, seen=HITS)
     assert aside.activity
     near = ask(OPENED, tick=300, walkers=THERE - np.array((0.9, 0.0, 0.0)))
-    assert near.activity == "giving way"  # they have not passed yet
+    assert near.activity == "giving way"  # the person has not passed yet
     passed = ask(OPENED, tick=350, walkers=THERE - np.array((1.2, 0.0, 0.0)))
     assert (passed.goal, passed.activity) == (Goal(x=6.0, y=3.0), "")
 
 
 @pytest.mark.parametrize(("meetings", "told"), [(10, ["giving way"] * 10), (11, [""])])
-def test_it_goes_aside_whenever_they_come_back(meetings: int, told: list[str]) -> None:
+def test_it_moves_aside_whenever_the_person_returns(meetings: int, told: list[str]) -> None:
     guide = RoutePlanner()
     ask = functools.partial(think, guide, goal=Goal(x=6.0, y=3.0), x=3.2, y=3.2)
     ask(OPENED, tick=1)
@@ -351,12 +351,12 @@ def test_it_goes_aside_whenever_they_come_back(meetings: int, told: list[str]) -
 @pytest.mark.parametrize(
     ("walkers", "seen"),
     [
-        (NOBODY, HITS),  # a thing
-        (THERE + np.array((0.0, 2.5, 0.0)), HITS),  # somebody elsewhere
-        (THERE, NOTHING),  # they have gone
+        (NOBODY, HITS),  # an object
+        (THERE + np.array((0.0, 2.5, 0.0)), HITS),  # a person elsewhere
+        (THERE, NOTHING),  # the person left
     ],
 )
-def test_it_does_not_go_aside_for_things_nor_for_who_is_not_there(
+def test_it_does_not_move_aside_for_objects_or_absent_people(
     walkers: np.ndarray, seen: np.ndarray
 ) -> None:
     assert not any(one.activity for one in goes_aside(BARRED, walkers, seen))
@@ -366,12 +366,12 @@ def walking(x: float, y: float, speed: float, number: int = 1) -> Obstacle:
     return Obstacle(id=number, x=x, y=y, velocity_x=speed, radius=0.2)
 
 
-def test_who_has_walked_is_remembered_where_they_stand() -> None:
+def test_a_person_who_walked_is_remembered_where_they_stand() -> None:
     walkers = Walkers()
     moved = Pose(x=1.0, y=2.0, yaw=math.pi / 2)
     walkers.update(10, (walking(0.7, 0.0, 0.5),), moved)
     walkers.update(12, (walking(1.1, 0.0, 0.5),), moved)
-    assert len(walkers.ways) == 0  # so far a post may seem to move, for a robot that turns
+    assert len(walkers.ways) == 0  # a post may seem to move so far while the robot turns
     walkers.update(15, (walking(1.3, 0.0, 0.5),), moved)
     walkers.update(20, (walking(1.3, 0.0, 0.0),), moved)
     assert walkers.ways == pytest.approx(np.array([[1.0, 3.3, math.pi / 2]]))
@@ -381,7 +381,7 @@ def test_who_has_walked_is_remembered_where_they_stand() -> None:
     assert len(walkers.ways) == 0
 
 
-def test_who_comes_back_is_remembered_where_they_stand() -> None:
+def test_a_person_who_returns_is_remembered_where_they_stand() -> None:
     walkers, here = Walkers(), Pose(x=0.0, y=0.0, yaw=0.0)
     for tick, x in enumerate((0.0, 0.3, 0.6, 0.3)):
         walkers.update(5 * tick, (walking(x, 0.0, 0.5 if x < 0.6 else -0.5),), here)
@@ -390,7 +390,7 @@ def test_who_comes_back_is_remembered_where_they_stand() -> None:
     assert len(standing(walkers.ways, np.array([[-0.1, 0.0]]))) == 1
 
 
-def test_who_creeps_on_is_remembered_where_they_stand() -> None:
+def test_a_person_who_moves_slowly_is_remembered_where_they_stand() -> None:
     walkers, here = Walkers(), Pose(x=1.0, y=0.0, yaw=0.0)
     for tick, x in enumerate((0.0, 0.3, 0.6)):
         walkers.update(5 * tick, (walking(x, 0.0, 0.5),), here)
@@ -398,10 +398,10 @@ def test_who_creeps_on_is_remembered_where_they_stand() -> None:
         walkers.update(5 * tick, (walking(0.6 + 0.01 * (tick - 2), 0.0, 0.0),), here)
     assert walkers.ways == pytest.approx(np.array([[1.77, 0.0, 0.0]]))
     walkers.update(3011, (walking(0.77, 0.0, 0.0),), here)
-    assert len(walkers.ways) == 0  # a minute after their last step
+    assert len(walkers.ways) == 0  # 60 s after the last motion
 
 
-def test_no_crowd_is_remembered_without_end() -> None:
+def test_the_number_of_remembered_people_is_limited() -> None:
     walkers = Walkers()
     for k in range(16):
         x, y = -0.6 * (1 - k % 2), 20.0 * (k // 2)
@@ -411,7 +411,7 @@ def test_no_crowd_is_remembered_without_end() -> None:
     assert walkers.ways[-1].tolist() == [38.0, 140.0, 0.0]
 
 
-def test_people_are_no_things_that_a_route_remembers() -> None:
+def test_contours_of_people_are_not_remembered_for_routes() -> None:
     person = np.array([[3.9, 2.8], [4.2, 2.8], [4.2, 3.2]])
     box = person + np.array((0.0, 1.0))
     ways = standing(THERE, HITS)

@@ -1,4 +1,4 @@
-"""Latency of the answers to scans, counted in ticks of the robot."""
+"""Latency from scans to intents, in ticks of the robot."""
 
 from gigabrain_zenoh.decision.context import ScanLatency
 
@@ -6,10 +6,10 @@ BOOT = 7
 
 
 def answered(late: ScanLatency, basis: int, begun: int, done: int) -> float:
-    """A scan of the tick `basis`, thought about from `begun` until just before `done`."""
+    """Process a scan of tick `basis` from `begun` until just before `done`."""
     late.observe_state(BOOT, begun)
     late.begin(begun, basis)
-    late.observe_state(BOOT, begun)  # the same state again says nothing
+    late.observe_state(BOOT, begun)  # the same state again is ignored
     late.observe_state(BOOT, done)
     return late.excess_s
 
@@ -21,7 +21,7 @@ def test_an_answer_within_two_ticks_is_in_time() -> None:
     assert answered(late, basis=20, begun=21, done=23) == 0.0
 
 
-def test_late_scans_and_slow_thoughts_count_alike() -> None:
+def test_late_scans_and_slow_steps_count_alike() -> None:
     assert answered(ScanLatency(), basis=10, begun=15, done=16) == 0.06
     assert answered(ScanLatency(), basis=10, begun=10, done=16) == 0.06
 
@@ -36,7 +36,7 @@ def test_the_slowest_of_the_last_two_seconds_counts() -> None:
     assert late.excess_s == 0.0
 
 
-def test_a_driver_that_starts_anew_begins_a_new_count() -> None:
+def test_a_restart_of_the_driver_resets_the_latency() -> None:
     late = ScanLatency()
     assert answered(late, basis=10, begun=10, done=16) == 0.06
     late.begin(20, 20)

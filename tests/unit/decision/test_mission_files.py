@@ -1,4 +1,4 @@
-"""The files of missions and patrols: what may be in them, and how they are refused."""
+"""Files of missions and patrols: valid contents and refusals."""
 
 from pathlib import Path
 
@@ -110,9 +110,7 @@ from gigabrain_zenoh.errors import ConfigError
         ("", "m:1: the file is empty"),
     ],
 )
-def test_a_mission_that_cannot_be_carried_out_is_refused_with_its_line(
-    text: str, problem: str
-) -> None:
+def test_an_invalid_mission_is_refused_with_its_line(text: str, problem: str) -> None:
     with pytest.raises(ConfigError) as refused:
         mission_files.loads(text, "m")
     assert problem in str(refused.value)
@@ -141,12 +139,12 @@ def test_a_goal_may_be_anywhere_that_a_message_can_hold() -> None:
     assert mission == missions.goal_mission(goal)
 
 
-def test_a_field_that_another_program_has_written_as_null_is_left_out() -> None:
+def test_a_field_with_the_value_null_is_ignored() -> None:
     mission = mission_files.loads('{"do": [{"goto": [1, 2], "explore": null}]}', "m")
     assert missions.text_of(mission) == '{"do":[{"goto":[1.0,2.0]}]}'
 
 
-def test_trees_that_multiply_are_refused() -> None:
+def test_trees_with_too_many_steps_when_expanded_are_refused() -> None:
     trees = "".join(f"  t{i}: [{{tree: t{i + 1}}}, {{tree: t{i + 1}}}]\n" for i in range(30))
     text = f"trees:\n{trees}  t30: [{{wait: 1}}]\ndo: [{{tree: t0}}]"
     with pytest.raises(ConfigError, match="more than 2000 steps once every tree is written out"):
@@ -155,7 +153,7 @@ def test_trees_that_multiply_are_refused() -> None:
 
 @pytest.mark.long
 @pytest.mark.parametrize("order", [1, -1])
-def test_trees_that_lead_deeper_than_can_be_carried_out_are_refused(order: int) -> None:
+def test_trees_that_are_too_deep_when_expanded_are_refused(order: int) -> None:
     def chain(count: int) -> str:
         inner = [f"  t{i}: [{{tree: t{i + 1}}}]\n" for i in range(count)][::order]
         return f"trees:\n{''.join(inner)}  t{count}: [{{wait: 1}}]\ndo: [{{tree: t0}}]"
@@ -166,7 +164,7 @@ def test_trees_that_lead_deeper_than_can_be_carried_out_are_refused(order: int) 
             mission_files.loads(chain(count), "m")
 
 
-def test_a_file_says_which_mission_and_which_programs_it_needs(tmp_path: Path) -> None:
+def test_a_mission_lists_its_programs_and_undefined_places(tmp_path: Path) -> None:
     file = tmp_path / "m.yaml"
     file.write_text("do: [{script: {run: beep}}, {wait: 3}]")
     mission, text = mission_files.load(file)
@@ -178,6 +176,6 @@ def test_a_file_says_which_mission_and_which_programs_it_needs(tmp_path: Path) -
         mission_files.load(file)
     file.write_text("do: [{goto: b}, {patrol: {points: [a, c]}}]\nplaces: {a: [1, 2]}")
     places = missions.map_places(mission_files.load(file)[0])
-    assert sorted(places) == ["b", "c"]  # the map may have it
+    assert sorted(places) == ["b", "c"]  # the map may define them
     with pytest.raises(ConfigError, match=r"x:1: do\[0\].goto: no place 'b'"):
         mission_files.loads(file.read_text(), "x", [Place(name="c", x=1.0, y=0.0)])

@@ -1,4 +1,4 @@
-"""The steps of missions, one kind after the other: what is wanted, and what becomes of it."""
+"""The steps of missions by kind: their commands and their results."""
 
 from collections.abc import Iterator
 
@@ -16,7 +16,7 @@ def robot() -> Iterator[Robot]:
         yield made
 
 
-def test_a_goal_is_an_order_until_it_is_reached(robot: Robot) -> None:
+def test_a_goal_is_a_command_until_it_is_reached(robot: Robot) -> None:
     name = robot.tasks.add_goal(Goal(x=4.0, y=1.0), "replace", "ann")
     assert name == "goal-1"
     assert [robot.step(), robot.step()] == [4.0, 4.0]
@@ -35,7 +35,7 @@ def test_a_goal_that_cannot_be_reached_fails_with_the_reason(robot: Robot) -> No
     assert robot.last == ("failed", "a wall")
 
 
-def test_a_sequence_goes_on_to_the_next_place_at_once(robot: Robot) -> None:
+def test_a_sequence_continues_with_the_next_place_at_once(robot: Robot) -> None:
     robot.carry_out("do: [{goto: a}, {goto: b}, {wait: 5}]")
     assert robot.step() == 1.0
     assert robot.reached() == 2.0
@@ -55,14 +55,14 @@ def test_a_step_after_a_wait_begins_with_no_progress(robot: Robot) -> None:
     assert (status.doing, status.progress, status.eta) == ("going to a", 0.0, None)
 
 
-def test_a_sequence_ends_with_what_fails(robot: Robot) -> None:
+def test_a_sequence_ends_with_the_step_that_fails(robot: Robot) -> None:
     robot.carry_out("do: [{goto: a}, {goto: b}]")
     robot.step()
     assert robot.failed() is None
     assert robot.last == ("failed", "a: no way")
 
 
-def test_a_fallback_takes_the_first_that_succeeds(robot: Robot) -> None:
+def test_a_fallback_ends_with_the_first_step_that_succeeds(robot: Robot) -> None:
     robot.carry_out("do: [{fallback: [{goto: a}, {goto: b}, {goto: c}]}]")
     assert robot.step() == 1.0
     assert robot.failed() == 2.0
@@ -70,14 +70,14 @@ def test_a_fallback_takes_the_first_that_succeeds(robot: Robot) -> None:
     assert robot.last[0] == "succeeded"
 
 
-def test_a_mission_that_succeeds_does_not_name_what_failed_before(robot: Robot) -> None:
+def test_a_mission_that_succeeds_does_not_name_earlier_failures(robot: Robot) -> None:
     robot.carry_out("do: [{fallback: [{goto: a}, {check: battery.percentage > 1}]}]")
     assert robot.step() == 1.0
     assert robot.failed("a wall") is None
     assert robot.last == ("succeeded", "")
 
 
-def test_a_retry_gives_a_new_order_each_time_and_gives_up_after_so_many(robot: Robot) -> None:
+def test_a_retry_issues_a_new_command_each_time_and_gives_up_after_the_last(robot: Robot) -> None:
     robot.carry_out("do: [{retry: {times: 3, do: [{goto: a}]}}]")
     robot.step()
     numbers = []
@@ -90,14 +90,14 @@ def test_a_retry_gives_a_new_order_each_time_and_gives_up_after_so_many(robot: R
     assert robot.last == ("failed", "a: no way")
 
 
-def test_a_timeout_fails_by_the_robots_time_and_withdraws_the_order(robot: Robot) -> None:
+def test_a_timeout_fails_by_the_robots_time_and_withdraws_the_command(robot: Robot) -> None:
     robot.carry_out("do: [{timeout: {seconds: 10, do: [{goto: a}]}}]")
-    assert [robot.step(5.0) for _ in range(3)] == [1.0, 1.0, 1.0]  # begun in the first step
+    assert [robot.step(5.0) for _ in range(3)] == [1.0, 1.0, 1.0]  # starts at the first step
     assert robot.step(0.1) is None
     assert robot.last == ("failed", "going to a: not done within 10 s")
 
 
-def test_a_pause_holds_the_time_of_a_timeout(robot: Robot) -> None:
+def test_a_pause_stops_the_timer_of_a_timeout(robot: Robot) -> None:
     robot.carry_out("do: [{timeout: {seconds: 10, do: [{goto: a}]}}]")
     robot.step()
     robot.tasks.pause("", "ann")
@@ -106,7 +106,7 @@ def test_a_pause_holds_the_time_of_a_timeout(robot: Robot) -> None:
     assert robot.step(1.0) == 1.0
 
 
-def test_a_patrol_goes_round_as_often_as_it_is_told(robot: Robot) -> None:
+def test_a_patrol_repeats_its_round_as_often_as_given(robot: Robot) -> None:
     robot.carry_out("do: [{patrol: {points: [a, [7, 7]], loops: 2}}]")
     seen = [robot.step()]
     while robot.status.current:
@@ -115,14 +115,14 @@ def test_a_patrol_goes_round_as_often_as_it_is_told(robot: Robot) -> None:
     assert robot.last[0] == "succeeded"
 
 
-def test_exploring_is_an_order_of_its_own(robot: Robot) -> None:
+def test_exploring_is_its_own_kind_of_command(robot: Robot) -> None:
     robot.carry_out("do: [{explore: {}}, {goto: dock}]")
     assert robot.step() == "explore"
     assert robot.reached() == 0.0
     assert robot.status.doing == "going to dock"
 
 
-def test_a_low_battery_sends_it_to_the_dock_and_then_on_where_it_was(robot: Robot) -> None:
+def test_a_low_battery_interrupts_the_mission_for_the_dock(robot: Robot) -> None:
     robot.carry_out(
         "do: [{battery_below: {percentage: 20, goto: dock, until: 80, do: [{goto: a}, {goto: b}]}}]"
     )
@@ -136,7 +136,7 @@ def test_a_low_battery_sends_it_to_the_dock_and_then_on_where_it_was(robot: Robo
     assert robot.step() is None
     robot.charge = 80.0
     robot.step()
-    assert robot.step() == 2.0  # and not to a again
+    assert robot.step() == 2.0  # it does not repeat place a
 
 
 def test_a_timeout_does_not_run_while_the_robot_charges(robot: Robot) -> None:
@@ -150,7 +150,7 @@ def test_a_timeout_does_not_run_while_the_robot_charges(robot: Robot) -> None:
     assert robot.step() == 0.0
     robot.reached()
     robot.step(3600.0)
-    again = Robot(robot.tasks.saved)  # and not over a restart either
+    again = Robot(robot.tasks.saved)  # the same after a restart
     for one in (robot, again):
         one.charge = 80.0
         one.step(600.0)
@@ -159,7 +159,7 @@ def test_a_timeout_does_not_run_while_the_robot_charges(robot: Robot) -> None:
         assert one.last == ("failed", "going to a: not done within 100 s")
 
 
-def test_a_timeout_round_all_of_it_runs_while_the_robot_charges(robot: Robot) -> None:
+def test_a_timeout_around_the_charging_runs_while_the_robot_charges(robot: Robot) -> None:
     low = "{battery_below: {percentage: 20, goto: dock, until: 80, do: [{goto: a}]}}"
     robot.carry_out(f"do: [{{timeout: {{seconds: 10, do: [{low}]}}}}]")
     robot.step()
@@ -182,7 +182,7 @@ def test_a_dock_that_does_not_charge_ends_the_mission(robot: Robot) -> None:
     )
 
 
-def test_waiting_until_a_field_is_as_wanted(robot: Robot) -> None:
+def test_waiting_until_a_condition_holds(robot: Robot) -> None:
     robot.carry_out("do: [{wait_until: pose.x > 2.5}]")
     robot.step()
     assert robot.status.doing == "waiting until pose.x > 2.5"
@@ -222,7 +222,7 @@ def test_a_check_of_a_silent_topic_fails_after_a_second(robot: Robot) -> None:
     assert robot.last == ("failed", "pose.y > 0 is not known")
 
 
-def test_a_script_is_run_and_what_it_comes_to_counts(robot: Robot) -> None:
+def test_a_script_is_run_and_its_result_counts(robot: Robot) -> None:
     robot.carry_out("do: [{script: {run: beep, arguments: [twice]}}, {goto: a}]")
     robot.step()
     program = robot.programs[0]
@@ -231,7 +231,7 @@ def test_a_script_is_run_and_what_it_comes_to_counts(robot: Robot) -> None:
     assert robot.step() == 1.0
 
 
-def test_a_script_that_fails_says_why_and_one_that_is_cancelled_is_ended(robot: Robot) -> None:
+def test_a_failed_script_gives_the_reason_and_a_cancelled_one_is_stopped(robot: Robot) -> None:
     robot.carry_out("do: [{script: {run: beep}}]")
     robot.step()
     robot.programs[0].result = False, "ended with exit code 3: no sound"
@@ -244,7 +244,7 @@ def test_a_script_that_fails_says_why_and_one_that_is_cancelled_is_ended(robot: 
     assert robot.programs[1].stopped
 
 
-def test_a_script_stands_still_while_its_mission_is_paused(robot: Robot) -> None:
+def test_a_script_is_paused_while_its_mission_is_paused(robot: Robot) -> None:
     robot.carry_out("do: [{script: {run: beep}}]")
     robot.step()
     robot.tasks.pause("", "ann")
@@ -256,7 +256,7 @@ def test_a_script_stands_still_while_its_mission_is_paused(robot: Robot) -> None
     robot.tasks.cancel("", "ann")
 
 
-def test_a_script_stands_still_while_another_task_comes_first(robot: Robot) -> None:
+def test_a_script_is_paused_while_another_task_is_active(robot: Robot) -> None:
     robot.carry_out("do: [{script: {run: beep}}]")
     robot.step()
     robot.carry_out("do: [{goto: a}]", "preempt")
@@ -267,7 +267,7 @@ def test_a_script_stands_still_while_another_task_comes_first(robot: Robot) -> N
     robot.tasks.cancel("", "ann")
 
 
-def test_a_script_stands_still_while_a_guard_has_interrupted_it(robot: Robot) -> None:
+def test_a_script_is_paused_while_a_guard_interrupts_it(robot: Robot) -> None:
     low = "battery_below: {percentage: 20, goto: dock, until: 80, do: [{script: {run: beep}}]}"
     robot.carry_out(f"do: [{{{low}}}]")
     robot.step()
@@ -281,7 +281,7 @@ def test_a_script_stands_still_while_a_guard_has_interrupted_it(robot: Robot) ->
     robot.tasks.cancel("", "ann")
 
 
-def test_a_script_that_is_paused_is_ended_with_its_mission(robot: Robot) -> None:
+def test_a_paused_script_is_stopped_with_its_mission(robot: Robot) -> None:
     robot.carry_out("do: [{script: {run: beep}}]")
     robot.step()
     robot.tasks.pause("", "ann")

@@ -1,4 +1,4 @@
-"""A body that can drive goes before what it cannot reach, and picks it up from there."""
+"""A body that can drive approaches a thing out of reach, and then picks it up."""
 
 import itertools
 from typing import Any
@@ -30,11 +30,11 @@ class Steps:
         self.command, _ = self.queue.step(0.02, outcome)
 
     def answer(self, **outcome: Any) -> None:
-        """End the present command."""
+        """End the current command with `outcome`."""
         self.step(StepOutcome(number=self.command.number, **outcome))
 
 
-def test_what_is_out_of_reach_is_driven_before_and_picked_up_from_there() -> None:
+def test_it_drives_to_a_thing_out_of_reach_and_picks_it_up() -> None:
     steps = Steps()
     assert isinstance(steps.command, ArmCommand)
     first = steps.command.number
@@ -49,7 +49,7 @@ def test_what_is_out_of_reach_is_driven_before_and_picked_up_from_there() -> Non
     assert steps.queue.status.done[0].state == "succeeded"
 
 
-def test_it_drives_four_times_and_then_says_why_it_fails() -> None:
+def test_it_drives_four_times_and_then_fails_with_the_reason() -> None:
     steps = Steps()
     for _ in range(4):
         steps.answer(**FAR)
@@ -60,14 +60,14 @@ def test_it_drives_four_times_and_then_says_why_it_fails() -> None:
     assert (done.state, done.reason) == ("failed", "picking up can: too far")
 
 
-def test_a_way_that_fails_is_the_reason() -> None:
+def test_a_failed_approach_is_the_reason_of_the_failure() -> None:
     steps = Steps()
     steps.answer(**FAR)
     steps.answer(state="failed", reason="no free and reachable place before can")
     assert steps.queue.status.done[0].reason == "no free and reachable place before can"
 
 
-def test_what_is_not_seen_is_looked_for_and_picked_up_where_it_is_found() -> None:
+def test_it_searches_for_an_unseen_thing_and_picks_it_up() -> None:
     known = Sought()
     steps = Steps(seek=lambda wanted, _without, _preferred: known if wanted == "can" else Sought())
     steps.answer(state="failed", reason="can is not seen", seek="can")
@@ -79,14 +79,14 @@ def test_what_is_not_seen_is_looked_for_and_picked_up_where_it_is_found() -> Non
     assert isinstance(steps.command, ArmCommand)
 
 
-def test_an_arm_alone_that_cannot_reach_fails_at_once() -> None:
+def test_a_fixed_arm_that_cannot_reach_fails_at_once() -> None:
     steps = Steps()
     steps.answer(state="failed", reason="too far")
     assert steps.queue.status.done[0].state == "failed"
 
 
 @pytest.mark.parametrize("given", ["label: can", "sphere: 0.03"])
-def test_what_was_seen_is_to_be_seen_again_after_it_was_put_down(given: str) -> None:
+def test_a_seen_thing_must_be_seen_again_after_it_was_put_down(given: str) -> None:
     steps = Steps(
         f"things: {{can: {{{given}}}}}\ndo: [{{pick: can}}, {{place: [0.2, 0]}}, {{pick: can}}]"
     )
@@ -95,7 +95,7 @@ def test_what_was_seen_is_to_be_seen_again_after_it_was_put_down(given: str) -> 
     assert steps.command.things["can"].at is None
 
 
-def test_what_was_lost_on_the_way_can_be_seen_and_picked_up_again() -> None:
+def test_a_thing_lost_on_the_way_can_be_seen_and_picked_up_again() -> None:
     steps = Steps("things: {can: {label: can}}\ndo: [{retry: {times: 2, do: [{pick: can}]}}]")
     held = HeldThing(
         name="can", solid=Solid(sphere=0.03, at=(0, 0, 0)), axes=(1, 0, 0, 0, 1, 0, 0, 0, 1),
@@ -108,7 +108,7 @@ def test_what_was_lost_on_the_way_can_be_seen_and_picked_up_again() -> None:
     assert steps.command.things == {"can": Solid(label="can")}
 
 
-def test_numbers_go_on() -> None:
+def test_command_numbers_continue() -> None:
     steps = Steps()
     numbers = [steps.command.number]
     for _ in range(3):

@@ -1,4 +1,4 @@
-"""A body's delay and lag, learnt while it drives."""
+"""Estimates of a body's delay and lag while it drives."""
 
 import itertools
 import math
@@ -13,11 +13,11 @@ from gigabrain_schemas.brain import ActuationModel, CmdVel
 from gigabrain_zenoh.decision.actuation_model import PRIOR, ActuationEstimator
 from gigabrain_zenoh.testing.samples import BOOT, DRIVING, state
 
-PARTS = 4  # of a tick, in which the plant moves
+PARTS = 4  # simulation steps per tick
 
 
 class Plant:
-    """A body that answers late and by and by, its commands, and noise on what it measures."""
+    """A simulated body with delay, lag and noise, and its estimator."""
 
     def __init__(
         self,
@@ -37,7 +37,7 @@ class Plant:
     def drive(
         self, v: float, w: float, ticks: int, *, gate: GateStatus = DRIVING, source: str = "control"
     ) -> ActuationModel:
-        """So many ticks on the way to a speed, with ramps as control makes them."""
+        """Drive towards a speed for some ticks, with ramps like those of control."""
         for _ in range(ticks):
             self.tick += 1
             measured_v = self.v + self._noise[0] * self._random.standard_normal()
@@ -55,7 +55,7 @@ class Plant:
         return self.estimator.response
 
     def wander(self, legs: int) -> ActuationModel:
-        """Another speed every half a second."""
+        """Drive at another speed every half second."""
         wishes = itertools.cycle([(0.4, 0.0), (0.1, 0.9), (0.5, -0.5), (0.0, -0.9), (0.3, 0.4)])
         for v, w in itertools.islice(wishes, legs):
             self.drive(v, w, 25)
@@ -64,9 +64,7 @@ class Plant:
 
 @pytest.mark.parametrize("delay", [0.0, 0.04, 0.1])
 @pytest.mark.parametrize("lag", [0.05, 0.15])
-def test_delay_and_lag_are_found_within_ten_seconds_of_driving_about(
-    delay: float, lag: float
-) -> None:
+def test_delay_and_lag_are_estimated_within_10_s_of_driving(delay: float, lag: float) -> None:
     plant = Plant(delay, lag)
     found = plant.wander(20)
     assert found.delay == pytest.approx(delay, abs=0.021)
@@ -75,26 +73,26 @@ def test_delay_and_lag_are_found_within_ten_seconds_of_driving_about(
     assert plant.estimator.response.turn_gain == pytest.approx(0.8, abs=0.04)
 
 
-def test_driving_on_and_turning_as_avoid_does_is_enough() -> None:
+def test_the_driving_pattern_of_avoid_is_enough() -> None:
     plant = Plant(0.1, 0.15)
     for v, w in [(0.2, 0.0), (0.0, -0.5)] * 3:
         found = plant.drive(v, w, 150)
     assert found.delay + found.lag == pytest.approx(0.25, abs=0.021)
 
 
-def test_what_is_slower_than_the_slowest_candidate_stays_within_bounds() -> None:
+def test_the_estimate_of_a_very_slow_body_stays_within_bounds() -> None:
     found = Plant(0.5, 1.0).wander(40)
     assert found.delay <= 0.3
     assert found.lag <= 0.5
 
 
-def test_a_body_at_rest_or_driving_steadily_teaches_nothing() -> None:
+def test_a_body_at_rest_or_at_constant_speed_gives_no_information() -> None:
     plant = Plant(0.1, 0.15)
     assert plant.drive(0.0, 0.0, 500) == PRIOR
     plant.v = plant.told_v = 0.3
     assert plant.drive(0.3, 0.0, 29) == PRIOR
     plant.wander(20)
-    learnt = plant.drive(0.3, 0.0, 100)  # the last change has been looked at
+    learnt = plant.drive(0.3, 0.0, 100)  # the last change is evaluated
     assert learnt != PRIOR
     assert plant.drive(0.3, 0.0, 1500) == learnt
 
@@ -107,22 +105,20 @@ def test_a_body_at_rest_or_driving_steadily_teaches_nothing() -> None:
         (DRIVING, "somebody"),
     ],
 )
-def test_commands_that_the_gate_does_not_let_through_teach_nothing(
-    gate: GateStatus, source: str
-) -> None:
+def test_commands_that_the_gate_blocks_give_no_information(gate: GateStatus, source: str) -> None:
     plant = Plant(0.1, 0.15)
     for v in (0.4, 0.0, 0.3, 0.1):
         assert plant.drive(v, 0.0, 50, gate=gate, source=source) == PRIOR
 
 
-def test_it_notices_when_the_body_becomes_slower() -> None:
+def test_the_estimate_follows_a_body_that_becomes_slower() -> None:
     plant = Plant(0.02, 0.06)
     assert plant.wander(40).lag == pytest.approx(0.06, abs=0.021)
     plant._follows = 1 - math.exp(-0.02 / PARTS / 0.25)
     assert plant.wander(160).lag == pytest.approx(0.25, abs=0.041)
 
 
-def test_a_new_start_of_the_driver_begins_anew() -> None:
+def test_a_restart_of_the_driver_resets_the_estimate() -> None:
     plant = Plant(0.1, 0.15)
     assert plant.wander(20) != PRIOR
     plant.estimator.add_state(state(1, boot=8))
@@ -144,14 +140,14 @@ def test_the_order_of_messages_within_a_few_ticks_does_not_matter() -> None:
     assert early.estimator.response.turn_gain == late.estimator.response.turn_gain
 
 
-def test_it_remembers_what_the_body_was_commanded_of_late() -> None:
+def test_it_remembers_recent_commands() -> None:
     plant = Plant()
     plant.drive(0.5, 0.0, 20)
     sent = plant.estimator.sent(17, 19)
     assert [(tick, round(told.linear_x, 2)) for tick, told in sent] == [(18, 0.36), (19, 0.38)]
 
 
-def test_states_and_commands_that_are_missing_now_and_then_do_no_harm() -> None:
+def test_occasional_missing_states_and_commands_do_no_harm() -> None:
     plant = Plant(0.1, 0.15)
     state_of, count = plant.estimator.add_state, itertools.count()
 
@@ -168,7 +164,7 @@ def told(tick: int, v: float = 0.0, source: str = "control", seq: int = 0) -> Cm
     return CmdVel(linear_x=v, source=source, boot=BOOT, tick=tick, seq=seq)
 
 
-def test_what_others_than_the_commander_send_does_not_count_as_commanded() -> None:
+def test_commands_of_others_than_the_commander_are_ignored() -> None:
     estimator = ActuationEstimator()
     estimator.add_state(state(10))
     estimator.add_command(told(10, 0.2))
@@ -176,7 +172,7 @@ def test_what_others_than_the_commander_send_does_not_count_as_commanded() -> No
     assert [speed.linear_x for _, speed in estimator.sent(0, 10)] == [0.2]
 
 
-def test_who_uses_the_commanders_name_is_believed_no_more_than_by_the_gate() -> None:
+def test_a_client_with_the_commanders_name_is_treated_as_by_the_gate() -> None:
     estimator = ActuationEstimator()
     estimator.add_state(state(11))
     for command in (told(10, -2.0), told(10, 0.2, seq=7), told(11, 0.3, seq=8), told(11, -2.0)):
@@ -194,7 +190,7 @@ def test_after_a_change_of_commander_the_new_ones_commands_count() -> None:
     assert [speed.linear_x for tick, speed in estimator.sent(10, 11)] == [0.1]
 
 
-def test_commands_of_ticks_that_are_far_off_are_not_kept() -> None:
+def test_commands_of_distant_ticks_are_not_stored() -> None:
     estimator = ActuationEstimator()
     estimator.add_state(state(10))
     for tick in range(10, 20_000):
@@ -202,7 +198,7 @@ def test_commands_of_ticks_that_are_far_off_are_not_kept() -> None:
     assert [tick for tick, _ in estimator.sent(0, 2**40)] == [10, 11, 12, 13, 14, 15]
 
 
-def test_however_many_sources_and_ticks_are_named_little_is_kept() -> None:
+def test_the_number_of_stored_commands_is_limited() -> None:
     estimator = ActuationEstimator()
     for tick in range(1, 200):
         estimator.add_state(state(tick))

@@ -1,4 +1,4 @@
-"""Decision forgets what blocked a route at a restart, and keeps zones until newer ones count."""
+"""Decision forgets blocking hits at a restart, and keeps zones until newer ones apply."""
 
 from collections.abc import Callable
 from types import SimpleNamespace
@@ -16,11 +16,11 @@ from tests.unit.navigation.drives import WAFFLE
 from tests.unit.navigation.grids import empty, grid_of
 
 CORRIDOR = empty(6.0, 2.0)
-PEOPLE = np.array([[3.0, y] for y in np.arange(0.05, 2.0, 0.05)])  # right across it
+PEOPLE = np.array([[3.0, y] for y in np.arange(0.05, 2.0, 0.05)])  # across the corridor
 CORNERS = ((0.0, 0.0), (1.0, 0.0), (1.0, 1.0))
 
 
-def test_who_stood_in_the_way_is_forgotten_when_the_driver_starts_anew() -> None:
+def test_blocking_hits_are_forgotten_when_the_driver_restarts() -> None:
     planner = RoutePlanner()
 
     def ask(tick: int, seen: Any = None, blocked: Route | None = None) -> Route:
@@ -52,7 +52,7 @@ def test_who_stood_in_the_way_is_forgotten_when_the_driver_starts_anew() -> None
 
 
 def source() -> tuple[ZoneSource, Callable[[Zones], None]]:
-    """Return zones as decision receives them, and what receives them."""
+    """Return a zone source, and the function that passes messages to it."""
     receives: list[Callable[[Zones], None]] = []
     bus = SimpleNamespace(latest=lambda _topic, on_new: receives.append(on_new))
     return ZoneSource(cast("Any", bus)), receives[0]
@@ -63,7 +63,7 @@ def zones(tick: int, count: int) -> Zones:
     return Zones(boot=7, tick=tick, zones=tuple(named))
 
 
-def test_zones_that_change_within_a_scan_are_those_of_before_until_the_next() -> None:
+def test_changed_zones_apply_from_the_next_scan_on() -> None:
     known, receive = source()
     receive(zones(900, 1))
     for count in range(2, KEPT):
@@ -74,7 +74,7 @@ def test_zones_that_change_within_a_scan_are_those_of_before_until_the_next() ->
     assert len(known.at(7, 1003).zones) == 2
 
 
-def test_more_changes_than_are_kept_leave_no_scan_without_zones() -> None:
+def test_a_scan_has_zones_after_more_changes_than_are_stored() -> None:
     known, receive = source()
     for count in range(2 * KEPT):
         receive(zones(1000 + count, count))

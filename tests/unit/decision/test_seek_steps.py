@@ -1,4 +1,4 @@
-"""The step that finds a thing or a tag: what it wants, and what becomes of it."""
+"""The step that searches for an object or tag: its commands and results."""
 
 from collections.abc import Collection
 
@@ -18,7 +18,7 @@ def can(number: int, x: float, y: float = 0.0, label: str = "can") -> MapObject:
 
 
 class Seeker(Robot):
-    """An executive that knows some things; it stands at the origin."""
+    """A robot at the origin that knows some objects."""
 
     def __init__(self, saved: Saved | None = None) -> None:
         super().__init__()
@@ -39,7 +39,7 @@ class Seeker(Robot):
         return sought(self.known, Pose(x=0.0, y=0.0, yaw=0.0), wanted, without, preferred)
 
 
-def test_it_looks_for_a_thing_and_drives_before_the_nearest_once_it_is_known() -> None:
+def test_it_looks_for_an_object_and_drives_to_the_nearest_once_it_is_known() -> None:
     robot = Seeker()
     robot.tasks.add_find("can", "replace", "ann")
     assert robot.wanted() == ("look", "")
@@ -47,7 +47,7 @@ def test_it_looks_for_a_thing_and_drives_before_the_nearest_once_it_is_known() -
     robot.knows(can(4, 5.0), can(9, 2.0), can(1, 0.1, label="ball"))
     assert robot.wanted() == ("approach", "can 9")
     assert robot.status.doing == "going before can 9"
-    robot.knows(can(4, 0.5), can(9, 2.04))  # it keeps to the one that it has chosen
+    robot.knows(can(4, 0.5), can(9, 2.04))  # it keeps its target
     number = robot.command.number if robot.command else 0
     assert robot.wanted() == ("approach", "can 9")
     assert robot.command
@@ -60,7 +60,7 @@ def test_it_looks_for_a_thing_and_drives_before_the_nearest_once_it_is_known() -
     assert (robot.status.done[0].kind, robot.status.done[0].label) == ("goal", "find a can")
 
 
-def test_what_is_not_known_any_more_under_way_is_looked_for_where_it_was() -> None:
+def test_an_object_lost_on_the_way_is_sought_at_its_last_place() -> None:
     robot = Seeker()
     robot.tasks.add_find("can", "replace", "ann")
     assert robot.wanted() == ("look", "")
@@ -72,11 +72,11 @@ def test_what_is_not_known_any_more_under_way_is_looked_for_where_it_was() -> No
     robot.reached()
     assert robot.wanted() == ("look", "")
     assert robot.command
-    assert robot.command.seek == seek  # what has been looked at counts on
+    assert robot.command.seek == seek  # the same search continues
     robot.knows(can(2, 2.1))
     assert robot.wanted() == ("approach", "can 2")
     robot.knows()
-    assert robot.wanted() == ("look", "")  # it was there once
+    assert robot.wanted() == ("look", "")  # it drove there once
     robot.knows(can(3, 3.0))
     assert robot.wanted() == ("approach", "can 3")
     robot.knows()
@@ -84,7 +84,7 @@ def test_what_is_not_known_any_more_under_way_is_looked_for_where_it_was() -> No
     assert robot.wanted() == ("look", "")
 
 
-def test_a_tag_that_is_not_known_any_more_on_arrival_is_not_found() -> None:
+def test_a_tag_lost_before_the_arrival_is_not_found() -> None:
     robot = Seeker()
     robot.carry_out("do: [{find: {tag: 0}}]")
     robot.knows(tags=(MapTag(id=0, x=2.0, y=0.0, z=0.4, yaw=3.0, size=0.16),))
@@ -94,7 +94,7 @@ def test_a_tag_that_is_not_known_any_more_on_arrival_is_not_found() -> None:
     assert robot.wanted() == ("look", "")
 
 
-def test_what_is_known_again_on_the_way_to_where_it_was_is_found() -> None:
+def test_an_object_that_is_seen_again_on_the_way_is_found() -> None:
     robot = Seeker()
     robot.tasks.add_find("can", "replace", "ann")
     robot.knows(can(1, 2.0))
@@ -107,7 +107,7 @@ def test_what_is_known_again_on_the_way_to_where_it_was_is_found() -> None:
     assert robot.last == ("succeeded", "it is there")
 
 
-def test_when_all_was_looked_at_it_fails_in_words() -> None:
+def test_it_fails_with_a_reason_once_everything_was_looked_at() -> None:
     robot = Seeker()
     robot.carry_out("do: [{find: umbrella}]")
     assert robot.wanted() == ("look", "")
@@ -134,13 +134,13 @@ def test_of_two_things_the_one_that_can_be_reached_will_do() -> None:
     )
 
 
-def test_while_nothing_is_recognised_it_waits_and_says_so() -> None:
+def test_it_waits_with_a_reason_while_recognition_does_not_run() -> None:
     robot = Seeker()
     robot.tasks.add_find("can", "replace", "ann")
     robot.known = ObjectMap()
     assert robot.wanted() is None
     assert "recognition" in robot.status.doing
-    robot.known = ObjectMap(objects=(can(1, 1.0),))  # what is known is driven to all the same
+    robot.known = ObjectMap(objects=(can(1, 1.0),))  # it still drives to known objects
     assert robot.wanted() == ("approach", "can 1")
 
 
@@ -159,7 +159,7 @@ def test_missions_name_tags_as_places_also_at_a_charger() -> None:
     assert robot.wanted() == ("approach", "tag 7")
 
 
-def test_a_find_goes_on_after_a_restart_of_decision() -> None:
+def test_a_search_continues_after_a_restart_of_decision() -> None:
     robot = Seeker()
     robot.carry_out("do: [{goto: a}, {find: can}]")
     robot.step()
@@ -178,14 +178,14 @@ def test_a_find_goes_on_after_a_restart_of_decision() -> None:
         ("do: [{goto: {tag: 7, more: 1}}]", "unknown field"),
     ],
 )
-def test_what_cannot_be_found_is_refused(text: str, why: str) -> None:
+def test_an_impossible_search_is_refused(text: str, why: str) -> None:
     with pytest.raises(ConfigError, match="m:1: ") as refused:
         loads(text, "m")
     assert why in str(refused.value)
     assert "\n" not in str(refused.value)
 
 
-def test_things_are_named_for_people() -> None:
+def test_texts_name_the_wanted_object() -> None:
     assert [named(one) for one in ("can", "umbrella", "Apple", 7)] == [
         "a can", "an umbrella", "an Apple", "tag 7",
     ]  # fmt: skip

@@ -1,4 +1,4 @@
-"""Places before things and tags, and the order in which unseen places are looked at."""
+"""Places in front of objects and tags, and the viewpoints of a search."""
 
 import math
 
@@ -39,7 +39,7 @@ def off(place: object, target: Target) -> tuple[float, float]:
     return math.hypot(target.x - x, target.y - y), abs(math.remainder(turn, math.tau))
 
 
-def test_it_stands_before_a_thing_on_the_near_side_and_faces_it() -> None:
+def test_it_stands_on_the_near_side_of_an_object_and_faces_it() -> None:
     target = can(4.0, 1.0)
     place = place_before(costs_of(ROOM), WAFFLE, HERE, target, GridSearch())
     assert place
@@ -49,7 +49,7 @@ def test_it_stands_before_a_thing_on_the_near_side_and_faces_it() -> None:
     assert place.x < 4.0
 
 
-def test_before_a_thing_in_a_corner_it_stands_where_it_fits() -> None:
+def test_it_finds_a_free_place_near_an_object_in_a_corner() -> None:
     target = can(5.8, 3.8)
     costs = costs_of(ROOM)
     place = place_before(costs, WAFFLE, HERE, target, GridSearch())
@@ -58,7 +58,7 @@ def test_before_a_thing_in_a_corner_it_stands_where_it_fits() -> None:
     assert off(place, target)[0] < 1.2
 
 
-def test_it_does_not_stand_behind_the_wall_from_a_thing() -> None:
+def test_it_does_not_stand_behind_a_wall() -> None:
     cells = ROOM.copy()
     cells[:30, 30] = 100  # a wall at x = 3 m, open above y = 3 m
     target = can(3.5, 1.0)
@@ -67,7 +67,7 @@ def test_it_does_not_stand_behind_the_wall_from_a_thing() -> None:
     assert place.x > 3.2
 
 
-def test_before_a_tag_it_stands_on_the_side_of_its_face() -> None:
+def test_it_stands_on_the_front_side_of_a_tag() -> None:
     target = Target(name="tag 7", x=5.9, y=2.0, radius=0.02, yaw=math.pi)
     place = place_before(costs_of(ROOM), WAFFLE, HERE, target, GridSearch())
     assert place
@@ -76,16 +76,16 @@ def test_before_a_tag_it_stands_on_the_side_of_its_face() -> None:
     assert place_before(costs_of(ROOM), WAFFLE, HERE, turned_away, GridSearch()) is None
 
 
-def test_where_no_place_is_free_there_is_none() -> None:
+def test_there_is_no_goal_without_a_free_place() -> None:
     cells = ROOM.copy()
-    cells[:, 30] = 100  # a wall right across
+    cells[:, 30] = 100  # a wall across
     assert place_before(costs_of(cells), WAFFLE, HERE, can(4.5, 1.0), GridSearch()) is None
     assert place_before(costs_of(ROOM), WAFFLE, HERE, can(1e5, -1e5), GridSearch()) is None
 
 
-def test_a_thing_shown_by_the_map_does_not_hide_itself() -> None:
+def test_an_object_in_the_map_does_not_hide_itself() -> None:
     cells = ROOM.copy()
-    cells[9:11, 39:41] = 100  # a box, round (4, 1)
+    cells[9:11, 39:41] = 100  # a box around (4, 1)
     target = Target(name="box 1", x=4.0, y=1.0, radius=0.15)
     place = place_before(costs_of(cells), WAFFLE, HERE, target, GridSearch())
     assert place
@@ -127,7 +127,7 @@ def search(cells: np.ndarray, *then: np.ndarray, most: int = 400) -> tuple[list[
 
 
 def seen_by(poses: list[Pose], cells: np.ndarray, *, close: bool = False) -> float:
-    """The share of the free cells that a camera has seen from one of these poses."""
+    """Return the share of free cells that a camera saw from one of these poses."""
     looks, costs = LookAround(), costs_of(cells)
     assert not close or looks.look_closer()
     for pose in poses:
@@ -137,14 +137,14 @@ def seen_by(poses: list[Pose], cells: np.ndarray, *, close: bool = False) -> flo
     return float(np.mean([tuple(one) in looks._seen for one in points.tolist()]))
 
 
-def test_it_looks_at_a_whole_room_and_then_says_that_nothing_is_there() -> None:
+def test_it_looks_at_a_whole_room_and_then_fails() -> None:
     poses, reason = search(ROOM)
     assert reason == "everything reachable was looked at"
     assert seen_by(poses, ROOM) > 0.9
-    assert len(poses) < 110  # places to look from, also those at the edges of the map
+    assert len(poses) < 110  # viewpoints, including those at the edges of the map
 
 
-def test_what_was_not_found_is_looked_for_again_from_nearer_by() -> None:
+def test_a_second_round_looks_from_nearer_by() -> None:
     poses, _ = search(ROOM)
     assert seen_by(poses, ROOM, close=True) > 0.9
     looks = LookAround()
@@ -152,7 +152,7 @@ def test_what_was_not_found_is_looked_for_again_from_nearer_by() -> None:
     assert not looks.look_closer()
 
 
-def test_a_camera_on_an_arm_looks_at_no_room() -> None:
+def test_a_camera_on_an_arm_is_not_used_to_look_around() -> None:
     before, armed = LookAround(), replace(ARMED, cameras=(replace(WRIST, yaw=2.0),))
     before.look(costs_of(ROOM), armed, HERE, 1)
     assert not before._seen
@@ -174,7 +174,7 @@ def test_it_looks_into_each_room_of_a_flat() -> None:
     assert seen_by(poses, cells) > 0.9
 
 
-def test_a_room_behind_a_wall_is_not_looked_for_for_ever() -> None:
+def test_a_search_ends_although_a_room_is_unreachable() -> None:
     cells = empty(8.0, 4.0)
     cells[:, 40] = 100
     poses, reason = search(cells)
@@ -183,7 +183,7 @@ def test_a_room_behind_a_wall_is_not_looked_for_for_ever() -> None:
 
 
 @pytest.mark.long
-def test_a_room_whose_door_somebody_stood_in_is_looked_into_as_well() -> None:
+def test_a_room_whose_door_was_blocked_by_a_person_is_searched_too() -> None:
     cells = empty(8.0, 4.0)
     cells[:, 40] = 100
     opened = cells.copy()
@@ -194,7 +194,7 @@ def test_a_room_whose_door_somebody_stood_in_is_looked_into_as_well() -> None:
 
 
 @pytest.mark.long
-def test_a_second_door_that_somebody_stands_in_is_waited_for_as_well() -> None:
+def test_it_also_waits_for_a_second_door_blocked_by_a_person() -> None:
     cells = empty(8.0, 4.0)
     cells[:, 40] = cells[:, 60] = 100
     first, second = cells.copy(), cells.copy()
@@ -205,7 +205,7 @@ def test_a_second_door_that_somebody_stands_in_is_waited_for_as_well() -> None:
 
 
 @pytest.mark.long
-def test_it_tries_again_to_get_to_unexplored_space_and_then_ends() -> None:
+def test_it_retries_to_reach_unexplored_space_and_then_ends() -> None:
     cells = np.full_like(empty(6.0, 4.0), 100)
     cells[1:-1, 1:-1] = 0
     cells[:, 40:] = -1
@@ -234,8 +234,8 @@ def test_it_turns_on_the_spot_before_it_drives() -> None:
     assert (poses[0].x, poses[0].y) == (1.0, 1.0)
 
 
-STANDS = np.array([[1.6, 2.2, -math.pi / 2]])  # somebody who came towards the robot,
-FRONT = np.array([[1.6, 2.0]])  # and a hit on them
+STANDS = np.array([[1.6, 2.2, -math.pi / 2]])  # a person who walked towards the robot,
+FRONT = np.array([[1.6, 2.0]])  # and a hit on the person
 
 
 def ask(planner: RoutePlanner, command: DriveCommand, cells: np.ndarray, tick: int) -> Route:
@@ -254,7 +254,7 @@ def ask(planner: RoutePlanner, command: DriveCommand, cells: np.ndarray, tick: i
 
 
 @pytest.mark.long
-def test_a_search_that_somebody_ends_goes_aside_for_them() -> None:
+def test_a_search_blocked_by_a_person_moves_aside() -> None:
     cells = np.full_like(empty(4.0, 3.0), 100)
     cells[1:-1, 1:-1] = 0
     planner, command = RoutePlanner(), DriveCommand(5, "look", seek=5)
@@ -267,13 +267,13 @@ def test_a_search_that_somebody_ends_goes_aside_for_them() -> None:
     away = next(one for one in routes if one.activity == "giving way")
     assert away.goal
     assert abs(away.goal.x - 1.6) >= 1.0
-    assert told.count("giving way") >= 30  # 15 s, and once more
+    assert told.count("giving way") >= 30  # twice for 15 s
     assert routes[-1].reason == "everything reachable was looked at"
 
 
-def test_a_place_before_a_thing_that_somebody_stands_in_is_waited_for_aside() -> None:
+def test_it_waits_aside_for_a_person_in_front_of_an_object() -> None:
     cells = ROOM.copy()
-    cells[30:51, 20:41] = 100  # round the thing
+    cells[30:51, 20:41] = 100  # around the object
     command = DriveCommand(1, "approach", target=Target(name="can 1", x=1.6, y=2.3, radius=0.03))
     planner = RoutePlanner()
     told = [ask(planner, command, cells, tick) for tick in (1, 200, 300, 1000, 1060)]
@@ -281,10 +281,10 @@ def test_a_place_before_a_thing_that_somebody_stands_in_is_waited_for_aside() ->
     assert ask(planner, command, ROOM, 1100).state == "running"
 
 
-def test_somebody_before_a_thing_has_ten_seconds_to_go_away() -> None:
+def test_a_person_in_front_of_an_object_has_10_s_to_leave() -> None:
     cells = ROOM.copy()
     target = Target(name="can 1", x=3.0, y=2.0, radius=0.03)
-    cells[10:31, 20:41] = 100  # round it
+    cells[10:31, 20:41] = 100  # around it
     planner = RoutePlanner()
 
     def state(cells: np.ndarray, tick: int) -> str:
@@ -327,6 +327,6 @@ def test_an_arrival_by_the_last_route_does_not_end_the_next_one(kind: str) -> No
     first = ask(1)
     second = ask(6, arrived=first)
     assert second.goal != first.goal
-    again = ask(11, arrived=first)  # while the second was being planned
+    again = ask(11, arrived=first)  # while the second one is planned
     assert (again.version, again.goal) == (second.version, second.goal)
     assert ask(16, arrived=second).goal != second.goal

@@ -1,4 +1,4 @@
-"""Matching of a mission's things with those that a camera sees, and postures to look from."""
+"""Matching of a mission's things with those that cameras see, and postures to look from."""
 
 import math
 from collections.abc import Callable
@@ -21,13 +21,13 @@ CUBE = SeenSolid(id=2, shape="box", size=(0.031, 0.03, 0.029), position=(0.2, 0.
 BALL = SeenSolid(id=3, shape="sphere", size=(0.02,), position=(0.4, 0.0, 0.02))
 
 
-def test_a_thing_of_a_class_is_the_nearest_one_of_it() -> None:
+def test_a_thing_with_a_class_is_the_nearest_one_seen() -> None:
     known, _ = located({"it": Solid(label="can")}, (CUBE, CAN))
     assert known["it"] == Solid(cylinder=(0.033, 0.115), at=(0.3, 0, 0.057))
     assert known["seen 2"] == Solid(box=CUBE.size, at=CUBE.position, yaw=0.3)  # type: ignore[arg-type]
 
 
-def test_a_thing_by_its_lengths_keeps_them_and_takes_the_place() -> None:
+def test_a_thing_with_a_size_keeps_it_and_gets_the_seen_place() -> None:
     cube = Solid(box=(0.03, 0.03, 0.03))
     known, _ = located({"cube": cube}, (CUBE, CAN, BALL))
     assert known["cube"] == Solid(box=(0.03, 0.03, 0.03), at=(0.2, 0.1, 0.015), yaw=0.3)
@@ -44,7 +44,7 @@ def test_heights_are_in_the_frame_of_an_arm_that_stands_on_something() -> None:
     assert heights == pytest.approx(expected)
 
 
-def test_a_long_box_is_turned_as_its_longer_side_is_seen() -> None:
+def test_a_long_box_is_turned_to_match_its_longer_side() -> None:
     seen = SeenSolid(id=4, shape="box", size=(0.03, 0.061, 0.03), position=(0.2, 0, 0.015), yaw=0.1)
     known, _ = located({"bar": Solid(box=(0.06, 0.03, 0.03))}, (seen,))
     assert known["bar"].yaw == pytest.approx(0.1 + math.pi / 2)
@@ -59,11 +59,11 @@ def test_a_long_box_is_turned_as_its_longer_side_is_seen() -> None:
         Solid(sphere=0.1),
     ],
 )
-def test_what_is_not_seen_has_no_place(wanted: Solid) -> None:
+def test_a_thing_that_is_not_seen_has_no_place(wanted: Solid) -> None:
     assert "it" not in located({"it": wanted}, (CUBE, CAN))[0]
 
 
-def test_two_things_of_one_kind_are_two() -> None:
+def test_two_equal_things_match_two_seen_ones() -> None:
     other = SeenSolid(id=5, shape="box", size=(0.03, 0.03, 0.03), position=(0.25, 0, 0.015))
     cube = Solid(box=(0.03, 0.03, 0.03))
     known, _ = located({"one": cube, "other": cube}, (CUBE, other))
@@ -71,25 +71,25 @@ def test_two_things_of_one_kind_are_two() -> None:
     assert known["other"].at == other.position
 
 
-def test_a_thing_that_stands_where_its_mission_says_is_no_second_one() -> None:
+def test_a_seen_thing_at_the_place_of_a_given_one_is_the_same() -> None:
     given = Solid(box=(0.03, 0.03, 0.03), at=(0.21, 0.1, 0.015))
     assert located({"cube": given}, (CUBE,)) == ({"cube": given}, {})
 
 
-def test_what_is_seen_far_away_is_not_in_the_way() -> None:
+def test_a_thing_seen_far_away_is_not_an_obstacle() -> None:
     far = SeenSolid(id=6, shape="sphere", size=(0.1,), position=(3.0, 0.0, 0.1))
     assert located({}, (far,)) == ({}, {})
 
 
-def test_what_the_gripper_holds_does_not_stand_where_it_was_seen() -> None:
+def test_a_held_thing_is_no_longer_where_it_was_seen() -> None:
     _, numbers = located({"it": Solid(label="can")}, (CUBE, CAN))
     assert numbers == {"it": CAN.id}
     known, _ = located({}, (CUBE, CAN), held=numbers["it"])
     assert known.keys() == {"seen 2"}
 
 
-class Heard:
-    """A bus on which things are seen."""
+class SeenBus:
+    """A bus that publishes seen things."""
 
     def __init__(self) -> None:
         self.subscribed: Callable[[Solids], None] | None = None
@@ -99,18 +99,18 @@ class Heard:
         self.subscribed = on_new
 
 
-def watching(body: BodyDescription) -> tuple[Heard, SeenThings]:
-    received = Heard()
+def watching(body: BodyDescription) -> tuple[SeenBus, SeenThings]:
+    received = SeenBus()
     seen = SeenThings(received.bus)
     seen.observe(body, state(1))
     return received, seen
 
 
-def test_things_are_where_they_are_after_the_body_has_driven_on() -> None:
+def test_seen_things_are_moved_to_the_current_frame_of_the_body() -> None:
     received, seen = watching(load_robot("lekiwi").description())
     assert received.subscribed
     received.subscribed(Solids(solids=(CAN,), boot=BOOT, tick=1, basis=1))
-    assert seen.at(state(1)) == ()  # it was not there before that state
+    assert seen.at(state(1)) == ()  # received after that state
     there = state(2, pose=(0.1, 0.0, math.pi / 2))
     seen.observe(None, there)
     (one,) = seen.at(there)
@@ -130,27 +130,27 @@ TURNED = state(3, pose=(0.1, 0.0, math.pi / 2))
         (TURNED, (CUBE,), (0.0, -0.2, 0.06)),
         (state(2), (CUBE,), (0.3, 0.0, 0.06)),
         (state(2), (CAN,), None),  # it is seen there
-        (state(1000), (), None),  # taken since, maybe
-        (state(3, pose=(1.5, 0.0, 0.0)), (), None),  # the body has driven off
+        (state(1000), (), None),  # it may be gone
+        (state(3, pose=(1.5, 0.0, 0.0)), (), None),  # the body drove off
         (replace(state(3), boot=BOOT + 1), (), None),
-        (state(1), (), None),  # the driver has begun again
+        (state(1), (), None),  # the driver restarted
     ],
 )
-def test_what_was_put_down_stands_there_until_it_is_seen_or_left(
+def test_a_thing_put_down_is_an_obstacle_until_it_is_seen_or_left(
     now: RobotState, seen: tuple[SeenSolid, ...], place: tuple[float, float, float] | None
 ) -> None:
     found = PUT.at(now, seen)
     assert (found and found.at) == (place and pytest.approx(place))
 
 
-def test_things_of_another_start_of_the_driver_do_not_count() -> None:
+def test_things_seen_in_another_start_of_the_driver_are_ignored() -> None:
     received, seen = watching(ARM)
     assert received.subscribed
     received.subscribed(Solids(solids=(CAN,), boot=BOOT + 1, tick=1, basis=1))
     assert seen.at(state(2)) == ()
 
 
-def test_a_body_without_a_camera_is_not_watched() -> None:
+def test_seen_things_are_not_subscribed_without_a_camera() -> None:
     received, seen = watching(load_robot("piper").description())
     assert received.subscribed is None
     assert seen.at(state(2)) == ()

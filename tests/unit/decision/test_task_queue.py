@@ -22,7 +22,7 @@ def robot() -> Iterator[Robot]:
         yield made
 
 
-def test_goals_wait_in_a_queue_or_go_first_or_stand_in_for_all(robot: Robot) -> None:
+def test_goals_are_queued_or_go_first_or_replace_all(robot: Robot) -> None:
     tasks = robot.tasks
     tasks.add_goal(Goal(x=1.0, y=0.0), "replace", "ann")
     tasks.add_goal(Goal(x=2.0, y=0.0), "queue", "ann")
@@ -38,7 +38,7 @@ def test_goals_wait_in_a_queue_or_go_first_or_stand_in_for_all(robot: Robot) -> 
     assert robot.last == ("cancelled", "replaced by goal-4")
 
 
-def test_how_a_task_ended_is_reported_in_words(robot: Robot) -> None:
+def test_the_end_of_a_task_is_described_as_text(robot: Robot) -> None:
     robot.carry_out("do: [{goto: a}]")
     robot.carry_out("do: [{goto: b}]")
     robot.step()
@@ -52,7 +52,7 @@ def test_how_a_task_ended_is_reported_in_words(robot: Robot) -> None:
     assert describe_end(robot.status.done[0]) == "mission-3 was cancelled by bob"
 
 
-def test_resuming_a_task_that_waits_for_another_names_that_one(robot: Robot) -> None:
+def test_resuming_a_task_that_waits_names_the_active_one(robot: Robot) -> None:
     robot.tasks.add_goal(Goal(x=1.0, y=0.0), "replace", "ann")
     robot.step()
     robot.tasks.add_goal(Goal(x=2.0, y=0.0), "preempt", "bob")
@@ -65,7 +65,7 @@ def test_resuming_a_task_that_waits_for_another_names_that_one(robot: Robot) -> 
         robot.tasks.resume("")
 
 
-def test_cancelling_goes_by_name_and_all_at_once(robot: Robot) -> None:
+def test_tasks_are_cancelled_by_name_or_all_at_once(robot: Robot) -> None:
     for x in (1.0, 2.0, 3.0):
         robot.tasks.add_goal(Goal(x=x, y=0.0), "queue", "ann")
     assert robot.tasks.cancel("goal-2", "bob") == "goal-2 is cancelled"
@@ -78,7 +78,7 @@ def test_cancelling_goes_by_name_and_all_at_once(robot: Robot) -> None:
         robot.tasks.cancel("", "bob")
 
 
-def test_a_task_that_is_not_there_is_named_with_those_that_are(robot: Robot) -> None:
+def test_an_unknown_task_is_refused_with_the_known_ones(robot: Robot) -> None:
     robot.tasks.add_goal(Goal(x=1.0, y=0.0), "queue", "ann")
     with pytest.raises(Refused, match="no task 'goal-7'; tasks: goal-1"):
         robot.tasks.cancel("goal-7", "bob")
@@ -86,7 +86,7 @@ def test_a_task_that_is_not_there_is_named_with_those_that_are(robot: Robot) -> 
         robot.tasks.resume("goal-1")
 
 
-def test_no_more_than_32_tasks_wait(robot: Robot) -> None:
+def test_at_most_32_tasks_are_queued(robot: Robot) -> None:
     for _ in range(33):
         robot.tasks.add_goal(Goal(x=1.0, y=0.0), "queue", "ann")
     with pytest.raises(Refused, match="32 tasks wait already; cancel some first"):
@@ -100,7 +100,7 @@ ROUND = (
 )
 
 
-def test_after_a_restart_a_mission_goes_on_with_the_step_it_was_at(robot: Robot) -> None:
+def test_after_a_restart_a_mission_continues_with_its_step(robot: Robot) -> None:
     robot.tasks.restart(7)
     robot.carry_out(ROUND)
     robot.tasks.add_goal(Goal(x=9.0, y=0.0), "queue", "ann")
@@ -117,16 +117,14 @@ def test_after_a_restart_a_mission_goes_on_with_the_step_it_was_at(robot: Robot)
     assert again.step() == 2.0
     again.reached()
     seen = [again.step(), again.reached(), again.reached()]
-    assert seen == [1.0, 2.0, 9.0]  # the third round, and what waited
+    assert seen == [1.0, 2.0, 9.0]  # the third round, and the queued task
     assert again.tasks.add_goal(Goal(x=1.0, y=0.0), "queue", "ann") == "goal-3"
 
 
 @pytest.mark.parametrize(
     "name", ["\x01", "\x7f", "\x9b", "\x85", "\u2028", "\ufeff", "\uffff", "🤖"]
 )
-def test_after_a_restart_a_name_may_hold_whatever_it_may_hold_before(
-    robot: Robot, name: str
-) -> None:
+def test_after_a_restart_a_name_may_contain_the_same_characters(robot: Robot, name: str) -> None:
     escaped = f'"a\\U{ord(name):08x}b"'
     robot.carry_out(f"trees: {{{escaped}: [{{goto: a}}]}}\ndo: [{{tree: {escaped}}}]")
     robot.tasks.add_find(f"a{name}b", "queue", "ann")
@@ -138,7 +136,7 @@ def test_after_a_restart_a_name_may_hold_whatever_it_may_hold_before(
     assert again.step() == 1.0
 
 
-def test_after_a_restart_a_mission_that_no_longer_holds_says_why(robot: Robot) -> None:
+def test_after_a_restart_an_invalid_mission_fails_with_the_reason(robot: Robot) -> None:
     robot.carry_out("do: [{check: pose.x > 1}, {wait: 1}]")
     (job,) = robot.tasks.saved.jobs
     other = replace(job, mission=job.mission.replace("pose.x", "pose.q"))
@@ -148,7 +146,7 @@ def test_after_a_restart_a_mission_that_no_longer_holds_says_why(robot: Robot) -
     assert reasons[1].startswith("the saved mission is invalid: m:1: do[0].check: no field 'q'")
 
 
-def test_after_a_restart_two_failures_are_still_two(robot: Robot) -> None:
+def test_after_a_restart_failures_are_still_counted(robot: Robot) -> None:
     robot.carry_out("do: [{retry: {times: 3, do: [{goto: a}]}}]")
     robot.step()
     robot.failed()
@@ -161,7 +159,7 @@ def test_after_a_restart_two_failures_are_still_two(robot: Robot) -> None:
     assert again.last == ("failed", "a: no way")
 
 
-def test_after_a_restart_a_paused_task_stays_paused_and_says_by_whom(robot: Robot) -> None:
+def test_after_a_restart_a_paused_task_stays_paused_with_its_reason(robot: Robot) -> None:
     robot.carry_out("do: [{script: {run: beep}}]")
     robot.step()
     robot.tasks.pause("", "ann")
@@ -192,7 +190,7 @@ def test_after_a_start_of_the_whole_robot_tasks_wait_for_a_person(robot: Robot) 
     )
     assert again.tasks.resume("") == "mission-1 is resumed"
     assert again.step() == 1.0
-    again.tasks.restart(9)  # a driver that starts anew alone: the gate asks for a person already
+    again.tasks.restart(9)  # only the driver restarted: the gate waits for a person already
     assert again.step() == 1.0
 
 
@@ -201,7 +199,7 @@ HOLDS = HeldThing(name="cup", solid=Solid(sphere=0.03), axes=LEVEL, grip=0.5, op
 
 
 @pytest.mark.long
-def test_a_queue_full_of_the_longest_missions_is_read_again(robot: Robot, tmp_path: Path) -> None:
+def test_a_file_of_the_longest_missions_can_be_read(robot: Robot, tmp_path: Path) -> None:
     names = [f"c{k}" for k in range(10_000, 14_800)]
     text = f"things: {{{','.join(f'{name}: {{sphere: 1}}' for name in names)}}}\ndo: [{{goto: a}}]"
     assert 0.9 * MAX_REQUEST_BYTES < len(text) < MAX_REQUEST_BYTES
@@ -216,7 +214,7 @@ def test_a_queue_full_of_the_longest_missions_is_read_again(robot: Robot, tmp_pa
     assert file.read() == (saved, "")
 
 
-def test_what_could_not_be_read_again_is_not_written(
+def test_a_file_too_large_to_be_read_is_not_written(
     robot: Robot, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     file, before = TaskFile(str(tmp_path)), Saved(held=HOLDS)

@@ -1,4 +1,4 @@
-"""Tasks on the bus and on disk: what is asked, answered, told and remembered."""
+"""Tasks on the bus and on disk: requests, replies, status and restarts."""
 
 import errno
 import os
@@ -30,7 +30,7 @@ async def site(tmp_path: Path) -> Site:
     return Site(tmp_path)
 
 
-async def test_a_goal_is_accepted_with_its_way_and_reported_from_then_on(site: Site) -> None:
+async def test_a_goal_is_accepted_with_its_path_and_then_published(site: Site) -> None:
     await site.step()
     reply = await site.go(3.0)
     assert reply == GoalReply(ok=True, text="goal-1: on the way, 4.2 m", goal="goal-1")
@@ -49,7 +49,7 @@ async def test_a_goal_is_accepted_with_its_way_and_reported_from_then_on(site: S
     await site.end()
 
 
-async def test_the_loop_goes_on_while_a_mission_is_read(
+async def test_the_event_loop_runs_while_a_mission_is_parsed(
     site: Site, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     readers: list[bool] = []
@@ -65,7 +65,7 @@ async def test_the_loop_goes_on_while_a_mission_is_read(
     await site.end()
 
 
-async def test_it_is_reported_five_times_a_second_of_the_robots_time(site: Site) -> None:
+async def test_the_status_is_published_at_5_hz_of_the_robots_time(site: Site) -> None:
     await site.step()
     before = len(site.told)
     for _ in range(20):
@@ -87,7 +87,7 @@ async def test_a_goal_that_cannot_be_reached_is_refused_and_changes_nothing(site
 
 
 @pytest.mark.parametrize("body", [b'{"x": NaN, "y": 0}', b'{"x": 1e999, "y": 0}', b'{"x": 1}'])
-async def test_a_goal_that_is_no_place_is_refused(site: Site, body: bytes) -> None:
+async def test_a_goal_without_valid_coordinates_is_refused(site: Site, body: bytes) -> None:
     replies = await site.net.network.transport().query("robot/goal", body, "", 1.0, "data")
     assert len(replies) == 1
     assert isinstance(replies[0], str)
@@ -115,7 +115,7 @@ async def test_missions_are_checked_before_they_are_accepted(site: Site, tmp_pat
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="names of files are text there")
-async def test_a_script_beside_one_whose_name_is_no_text_is_refused_in_words(
+async def test_an_unknown_script_beside_one_with_an_undecodable_name_is_refused(
     tmp_path: Path,
 ) -> None:
     (tmp_path / os.fsdecode(b"caf\xe9")).touch()
@@ -127,7 +127,7 @@ async def test_a_script_beside_one_whose_name_is_no_text_is_refused_in_words(
     await site.end()
 
 
-async def test_a_folder_of_scripts_that_cannot_be_searched_is_named(
+async def test_a_folder_of_scripts_that_cannot_be_read_is_named(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def closed(_: Path) -> bool:
@@ -143,7 +143,7 @@ async def test_a_folder_of_scripts_that_cannot_be_searched_is_named(
     await site.end()
 
 
-async def test_a_check_of_a_topic_that_nothing_has_read_before_waits_for_its_message(
+async def test_the_first_check_of_a_topic_waits_for_its_message(
     site: Site,
 ) -> None:
     await site.step()
@@ -200,14 +200,14 @@ async def test_tasks_survive_a_restart_of_decision(site: Site, tmp_path: Path) -
 @pytest.mark.parametrize(
     ("map", "loaded", "goes_on"), [("hall", 1, True), ("yard", 1, False), ("hall", 2, False)]
 )
-async def test_tasks_go_on_only_in_their_map_after_a_restart_of_decision(
+async def test_tasks_continue_only_in_their_map_after_a_restart_of_decision(
     site: Site, tmp_path: Path, map: str, loaded: int, goes_on: bool
 ) -> None:
     site.net.two.publish(ZONES, Zones(boot=BOOT, map="", maps_loaded=1))
     await site.step()
     await site.go(3.0)
     await site.step()
-    site.net.two.publish(ZONES, Zones(boot=BOOT, map="hall", maps_loaded=1))  # it is saved
+    site.net.two.publish(ZONES, Zones(boot=BOOT, map="hall", maps_loaded=1))  # the map is saved
     await site.step()
     assert site.command
     await site.end()
@@ -222,7 +222,7 @@ async def test_tasks_go_on_only_in_their_map_after_a_restart_of_decision(
 
 
 @pytest.mark.parametrize(("known", "ok"), [(True, False), (False, True)])
-async def test_what_was_asked_for_another_map_is_not_accepted_in_the_new_one(
+async def test_a_request_is_refused_if_another_map_is_loaded_meanwhile(
     site: Site, monkeypatch: pytest.MonkeyPatch, known: bool, ok: bool
 ) -> None:
     loaded = 0
@@ -235,7 +235,7 @@ async def test_what_was_asked_for_another_map_is_not_accepted_in_the_new_one(
         return "on the way, 4.2 m"
 
     monkeypatch.setattr(site.service, "_check", check)
-    if known:  # else the first message of perception only comes meanwhile
+    if known:  # else the first message arrives during the check
         site.net.two.publish(ZONES, Zones(boot=BOOT, map="house", maps_loaded=0))
     await site.step()
     goal = await site.go(3.0)
@@ -267,7 +267,7 @@ async def test_tasks_of_another_start_of_the_robot_wait_for_a_person(
 @pytest.mark.parametrize(
     "content", [b'{"type":"gigabrain tasks","co', b'{"jobs": 3}', b"", b"\xff"]
 )
-async def test_a_file_that_is_cut_or_foreign_is_set_aside_and_reported(
+async def test_a_damaged_file_is_renamed_and_reported(
     tmp_path: Path, content: bytes, caplog: pytest.LogCaptureFixture
 ) -> None:
     (tmp_path / "tasks.json").write_bytes(content)
@@ -281,7 +281,7 @@ async def test_a_file_that_is_cut_or_foreign_is_set_aside_and_reported(
     assert len(TaskFile(str(tmp_path)).read()[0].jobs) == 1
 
 
-async def test_a_disk_that_cannot_be_written_is_reported_and_the_robot_goes_on(
+async def test_a_disk_that_cannot_be_written_is_reported_and_the_robot_continues(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     (tmp_path / "file").touch()
@@ -295,7 +295,7 @@ async def test_a_disk_that_cannot_be_written_is_reported_and_the_robot_goes_on(
     assert "tasks will not survive a restart" in caplog.text
 
 
-async def test_a_task_that_is_cancelled_while_the_disk_is_full_does_not_come_back(
+async def test_a_task_cancelled_while_the_disk_is_full_does_not_return(
     tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def full(*_: object) -> None:
@@ -324,7 +324,7 @@ async def test_a_task_that_is_cancelled_while_the_disk_is_full_does_not_come_bac
     ]
 
 
-async def test_what_was_granted_is_published_with_the_tick_and_the_world_from_which_it_counts(
+async def test_accepted_requests_are_published_with_the_tick_and_world_model_of_their_effect(
     site: Site,
 ) -> None:
     told: list[AcceptedRequest] = []
