@@ -205,18 +205,21 @@ def _steps(
     cost: Costs, bound: BlockBounds, row: int, column: int
 ) -> tuple[float, float, float, float, float, float, float, float]:
     """Return the costs of the eight steps from a vertex; inf outside the grid."""
-    one, across = float(BLOCK), BLOCK * DIAGONAL
-    before, behind = _price(cost, bound, row - 1, column - 1), _price(cost, bound, row - 1, column)
-    left, right = _price(cost, bound, row, column - 1), _price(cost, bound, row, column)
+    straight, diagonal = float(BLOCK), BLOCK * DIAGONAL
+    lower_left, lower_right = (
+        _price(cost, bound, row - 1, column - 1),
+        _price(cost, bound, row - 1, column),
+    )
+    upper_left, upper_right = _price(cost, bound, row, column - 1), _price(cost, bound, row, column)
     return (
-        one * min(behind, right),
-        across * behind,
-        one * min(before, behind),
-        across * before,
-        one * min(before, left),
-        across * left,
-        one * min(left, right),
-        across * right,
+        straight * min(lower_right, upper_right),
+        diagonal * lower_right,
+        straight * min(lower_left, lower_right),
+        diagonal * lower_left,
+        straight * min(lower_left, upper_left),
+        diagonal * upper_left,
+        straight * min(upper_left, upper_right),
+        diagonal * upper_right,
     )
 
 

@@ -23,7 +23,7 @@ MAX_POINTS = 20_000
 
 def placed(contours: Sequence[Contour], pose: Pose) -> tuple[Floats, ...]:
     """Return the polygons (n, 2) [m] of `contours`, seen from a body at `pose`."""
-    return tuple(transform(from_pose(pose), np.array(one.polygon)) for one in contours)
+    return tuple(transform(from_pose(pose), np.array(contour.polygon)) for contour in contours)
 
 
 def covered(polygons: Sequence[Floats], side: int) -> NDArray[np.bool_]:
@@ -127,7 +127,7 @@ def _cells_of(contours: Sequence[Floats], here: Pose) -> NDArray[np.int64]:
     """Return the cells (n, 2: column, row) that polygons cover within FAR_M of `here`."""
     side = round(2 * FAR_M / CELL_M)
     corner = np.floor((np.array((here.x, here.y)) - FAR_M) / CELL_M).astype(np.float64)
-    rows, columns = np.nonzero(covered([one / CELL_M - corner for one in contours], side))
+    rows, columns = np.nonzero(covered([polygon / CELL_M - corner for polygon in contours], side))
     return np.column_stack((columns, rows)).astype(np.int64) + corner.astype(np.int64)
 
 

@@ -115,11 +115,11 @@ def _arrived(scene: Scene, x: float, y: float, yaw: float) -> bool:
 def motion_cost(weights: Weights, room: float, vx: float, vy: float, w: float) -> float:
     """Return the cost of a second at this velocity, `room` [m] from obstacles."""
     cost = weights.turning * w * w
-    over = math.sqrt(vx * vx + vy * vy) - (
+    excess = math.sqrt(vx * vx + vy * vy) - (
         weights.tight_speed + weights.tight_rate * (room - weights.margin)
     )
-    if over > 0.0:
-        cost += weights.tight * over * over
+    if excess > 0.0:
+        cost += weights.tight * excess * excess
     if vx < 0.0:
         cost -= weights.backwards * vx
     return cost
@@ -131,18 +131,20 @@ def braking_cost(problem: Problem, room: float, motion: MotionState) -> float:
     model, vx, vy = problem.model, motion.vx, motion.vy
     speed = math.sqrt(vx * vx + vy * vy)
     brake, t = model.deceleration, model.reaction_time
-    needs = speed * t + speed * speed / (2.0 * brake) + model.margin
-    if speed < SLOW_SPEED or room >= needs:
+    stopping_distance = speed * t + speed * speed / (2.0 * brake) + model.margin
+    if speed < SLOW_SPEED or room >= stopping_distance:
         return 0.0
     sign = 1.0 if vx >= 0.0 else -1.0
     grid, side = problem.scene.grid, model.side_margin
     if model.strafes:
-        free = free_along(grid, problem.outline, motion.at, (vx / speed, vy / speed), side, needs)
+        free = free_along(
+            grid, problem.outline, motion.at, (vx / speed, vy / speed), side, stopping_distance
+        )
     else:
-        free = free_ahead(grid, problem.outline, motion.at, sign, side, needs)
+        free = free_ahead(grid, problem.outline, motion.at, sign, side, stopping_distance)
     allowed = math.sqrt((brake * t) ** 2 + 2.0 * brake * max(0.0, free - model.margin)) - brake * t
-    over = max(0.0, speed - allowed) / model.forward
-    return BRAKING_COST * over * over
+    excess = max(0.0, speed - allowed) / model.forward
+    return BRAKING_COST * excess * excess
 
 
 @lean_kernel
@@ -208,9 +210,9 @@ def _strafing_cost(model: MotionModel, turn: float, way: float) -> float:
 
 
 @lean_kernel
-def _turn_between(one: float, other: float) -> float:
+def _turn_between(first: float, second: float) -> float:
     """Return the angle between two directions [rad], 0 to pi."""
-    turn = one - other
+    turn = first - second
     return abs(turn - math.tau * math.floor(turn / math.tau + 0.5))
 
 
@@ -313,59 +315,63 @@ def evaluate_surroundings(problem: Problem, states: Floats) -> None:
 def fill_clearances(scene: Scene, outline: Outline, states: Floats, rooms: Floats) -> None:
     """Fill `rooms` (n,) with the clearances [m] of the first `states`, equal in all lanes."""
     for t in range(len(rooms)):
-        one = states[t]
-        found = clearance_of(
-            scene.grid, outline, motion_of(one, int(NONE)).at, one[MIDDLE_DISTANCE], int(NONE)
+        state = states[t]
+        clearance = clearance_of(
+            scene.grid, outline, motion_of(state, int(NONE)).at, state[MIDDLE_DISTANCE], int(NONE)
         )
-        rooms[t] = found[0]
+        rooms[t] = clearance[0]
 
 
 @lean_kernel
 def plan_cost(problem: Problem, rooms: Floats, states: Floats, lane: int, limit: float) -> float:
-    """Return the cost of a lane's `states`; inf if it is at least `limit`.
+    """Return the cost of a lane's `states`; inf once it is known to reach `limit`.
 
     `rooms` are the result of `fill_clearances`.
     """
     model, outline, weights, scene, dt = problem
-    least = min(weights.margin, rooms[0] - START_TOLERANCE_M)
-    least_disc = min(weights.disc_margin, states[0, DISC_DISTANCE + lane] - START_TOLERANCE_M)
+    min_room = min(weights.margin, rooms[0] - START_TOLERANCE_M)
+    min_disc_distance = min(
+        weights.disc_margin, states[0, DISC_DISTANCE + lane] - START_TOLERANCE_M
+    )
     end = terminal_cost(problem, motion_of(states[-1], lane))
-    to_come = -math.inf
+    bound_to_come = -math.inf
     if limit < math.inf:
-        with_contact, without_contact = _lower_bounds(problem, states, lane, (least, least_disc))
-        to_come = without_contact + end if with_contact >= limit else -math.inf
+        with_contact, without_contact = _lower_bounds(
+            problem, states, lane, (min_room, min_disc_distance)
+        )
+        bound_to_come = without_contact + end if with_contact >= limit else -math.inf
         if min(with_contact, without_contact + end) >= limit:
             return math.inf
     cost: float = 0.0
-    room, slack, touches, looked = MAX_CLEARANCE_M, 0.0, int(NONE), False
+    room, slack, group, checked = MAX_CLEARANCE_M, 0.0, int(NONE), False
     steps = states.shape[0] - 1
     for t in range(1, steps + 1):
-        if cost + to_come >= limit:
+        if cost + bound_to_come >= limit:
             return math.inf
-        one = states[t]
-        motion = motion_of(one, lane)
+        state = states[t]
+        motion = motion_of(state, lane)
         x, y, vx, vy = motion.at.x, motion.at.y, motion.vx, motion.vy
-        slack -= one[MOVED + lane]
-        looked = slack < 0.0 and not (looked and room - one[MOVED + lane] > least)
-        if looked:
+        slack -= state[MOVED + lane]
+        checked = slack < 0.0 and not (checked and room - state[MOVED + lane] > min_room)
+        if checked:
             if t < len(rooms):
                 room = rooms[t]
             else:
-                room, touches = clearance_of(
-                    scene.grid, outline, motion.at, one[MIDDLE_DISTANCE + lane], touches
+                room, group = clearance_of(
+                    scene.grid, outline, motion.at, state[MIDDLE_DISTANCE + lane], group
                 )
             slack = room - AMPLE_ROOM_M
-        away = one[DISC_DISTANCE + lane]
-        if room < least:
+        away = state[DISC_DISTANCE + lane]
+        if room < min_room:
             cost += contact_cost(t / steps) + remaining_cost(model, scene, x, y, motion.yaw)
             return cost + IMPACT_COST * math.hypot(vx, vy)
-        if away < least_disc:
-            left = remaining_cost(model, scene, x, y, motion.yaw)
-            return cost + disc_contact_cost(weights, t * dt, t / steps) + left
-        cost += dt * one[DISC_COST + lane]
+        if away < min_disc_distance:
+            to_go = remaining_cost(model, scene, x, y, motion.yaw)
+            return cost + disc_contact_cost(weights, t * dt, t / steps) + to_go
+        cost += dt * state[DISC_COST + lane]
         cost += dt * place_cost(weights, scene, room, away, motion)
         cost += dt * motion_cost(weights, room, vx, vy, motion.w)
-        to_come -= dt * (one[MIN_COST + lane] + one[DISC_COST + lane])
+        bound_to_come -= dt * (state[MIN_COST + lane] + state[DISC_COST + lane])
         if t % BRAKING_CHECK_STEPS == 1:
             cost += dt * BRAKING_CHECK_STEPS * braking_cost(problem, room, motion)
     return cost + end
@@ -392,19 +398,19 @@ def _lower_bounds(
     steps = states.shape[0] - 1
     with_contact, spent = math.inf, 0.0
     for t in range(1, steps + 1):
-        one = states[t]
-        middle, hits_disc = one[MIDDLE_DISTANCE + lane], one[DISC_DISTANCE + lane] < least[1]
+        state = states[t]
+        middle, hits_disc = state[MIDDLE_DISTANCE + lane], state[DISC_DISTANCE + lane] < least[1]
         if middle < possible or hits_disc:
-            left = spent + remaining_cost(
-                model, scene, one[X + lane], one[Y + lane], one[YAW + lane]
+            cost_at_contact = spent + remaining_cost(
+                model, scene, state[X + lane], state[Y + lane], state[YAW + lane]
             )
             if middle < possible:
-                with_contact = min(with_contact, left + contact_cost(t / steps))
+                with_contact = min(with_contact, cost_at_contact + contact_cost(t / steps))
             if hits_disc:
                 with_contact = min(
-                    with_contact, left + disc_contact_cost(weights, t * dt, t / steps)
+                    with_contact, cost_at_contact + disc_contact_cost(weights, t * dt, t / steps)
                 )
         if middle < certain or hits_disc:
             return with_contact, math.inf
-        spent += dt * (one[MIN_COST + lane] + one[DISC_COST + lane])
+        spent += dt * (state[MIN_COST + lane] + state[DISC_COST + lane])
     return with_contact, spent

@@ -151,20 +151,20 @@ def _fill_costs(distance: Singles, half_width: np.float32, half: np.float32, hal
         for end in (0, side + 1):
             halves[0, row, end] = halves[1, row, end] = np.int32(BEYOND * half)
     touching, inside = np.float32(TOUCHING), np.float32(INSIDE)
-    per_over, share = np.float32(1.0 / TIGHT_OVER / 2**HALVINGS), np.float32(1.0 / COARSER**2)
-    one, tight, well_in = np.float32(1.0), np.float32(TIGHT), np.float32(0.6) * half_width
+    per_decay, share = np.float32(1.0 / TIGHT_OVER / 2**HALVINGS), np.float32(1.0 / COARSER**2)
+    one, tight, deep_inside = np.float32(1.0), np.float32(TIGHT), np.float32(0.6) * half_width
     for row in range(side):
         first, second = distance[2 * row], distance[2 * row + 1]
         straight, diagonal = halves[0, row, 1 : side + 1], halves[1, row, 1 : side + 1]
         for j in range(side):
             away = (first[2 * j] + first[2 * j + 1] + second[2 * j] + second[2 * j + 1]) * share
-            y = (half_width - away) * per_over
+            y = (half_width - away) * per_decay
             near = one + y * (one + y * (SECOND + y * (THIRD + y * FOURTH)))
             for _ in range(HALVINGS):
                 near *= near
             price = one + tight * near
             price = price if away >= half_width else touching
-            price = price if away >= well_in else inside
+            price = price if away >= deep_inside else inside
             straight[j], diagonal[j] = np.int32(price * half), np.int32(price * slant)
 
 
@@ -228,10 +228,10 @@ def _lower_from_row(halves: Units, field: Units, beside: int, i: int) -> bool:
     Slices are vectorised, indices are not.
     """
     n = field.shape[1]
-    known, here = field[beside], field[i, 1 : n - 1]
+    others, here = field[beside], field[i, 1 : n - 1]
     own, own_diagonal = halves[0, i, 1 : n - 1], halves[1, i, 1 : n - 1]
     straight, diagonal = halves[0, beside, 1 : n - 1], halves[1, beside]
-    a, b, c, p, r = known[: n - 2], known[1 : n - 1], known[2:], diagonal[: n - 2], diagonal[2:]
+    a, b, c, p, r = others[: n - 2], others[1 : n - 1], others[2:], diagonal[: n - 2], diagonal[2:]
     changed = False
     for j in range(n - 2):
         left, right = np.int32(a[j] + p[j]), np.int32(c[j] + r[j])

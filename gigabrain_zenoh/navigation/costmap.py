@@ -259,13 +259,13 @@ def _changed_box(before: Cells, now: Cells) -> Box:
     height, width = now.shape
     top, bottom, left, right = height, 0, width, 0
     for row in range(height):
-        one, other, differs = before[row], now[row], np.uint8(0)
+        old, new, differs = before[row], now[row], np.uint8(0)
         for column in range(width):  # vectorised, as it has no branch
-            differs = np.uint8(differs | np.uint8(one[column] ^ other[column]))
+            differs = np.uint8(differs | np.uint8(old[column] ^ new[column]))
         if not differs:
             continue
         top, bottom = min(top, row), row + 1
         for column in range(width):
-            if one[column] != other[column]:
+            if old[column] != new[column]:
                 left, right = min(left, column), max(right, column + 1)
     return (top, bottom, left, right) if bottom else (0, 0, 0, 0)

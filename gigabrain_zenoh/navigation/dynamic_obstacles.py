@@ -204,16 +204,16 @@ def discs_of(obstacles: tuple[Obstacle, ...]) -> Floats:
     """Return the discs (m, 6) of moving obstacles, see `planning_problem.Scene`."""
     rows = [
         (
-            one.x,
-            one.y,
-            one.velocity_x,
-            one.velocity_y,
-            one.radius,
-            min(MAX_GROWTH_SPEED, _speed_sigma(one)),
+            obstacle.x,
+            obstacle.y,
+            obstacle.velocity_x,
+            obstacle.velocity_y,
+            obstacle.radius,
+            min(MAX_GROWTH_SPEED, _speed_sigma(obstacle)),
         )
-        for one in obstacles
-        if math.hypot(one.velocity_x, one.velocity_y)
-        > max(MOVING_SPEED, MOVING_SIGMAS * _speed_sigma(one))
+        for obstacle in obstacles
+        if math.hypot(obstacle.velocity_x, obstacle.velocity_y)
+        > max(MOVING_SPEED, MOVING_SIGMAS * _speed_sigma(obstacle))
     ]
     return np.array(rows, dtype=np.float64).reshape(-1, 6)
 

@@ -294,7 +294,9 @@ def next_frontier(
     space remains.
     """
     return min(
-        frontiers(costmap, robot, blacklist, search), key=lambda one: one.score, default=None
+        frontiers(costmap, robot, blacklist, search),
+        key=lambda frontier: frontier.score,
+        default=None,
     )
 
 

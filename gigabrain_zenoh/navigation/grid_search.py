@@ -155,10 +155,10 @@ class GridSearch:
 @kernel
 def _search(
     cost: Costs, against: WayBits, start: Cell, target: Cell, reverse: bool, run_mark: int,
-    held: SearchMemory, bound: BlockBounds,
+    memory: SearchMemory, bound: BlockBounds,
 ) -> int:  # fmt: skip
     """Settle cells until no path to `target` is cheaper; return their number or OUT_OF_ENTRIES."""
-    (height, width), flat, (g, mark, first, entries) = cost.shape, cost.ravel(), held
+    (height, width), flat, (g, mark, first, entries) = cost.shape, cost.ravel(), memory
     lanes = against.ravel()
     first[:] = NOWHERE
     at, best = start[0] * width + start[1], np.inf  # cost of the best path to `target` so far

@@ -301,20 +301,23 @@ def search(
                 _set_node(memory, count, (goal[0], goal[1], to_yaw), total, node, SHOT)
                 _push(heap, size, total, count)
                 found, count, size = count, count + 1, size + 1
-        for to in range(2 * len(BENDS)):
-            share, length = BENDS[to % len(BENDS)], STEP_M if to < len(BENDS) else -STEP_M
+        for next_move in range(2 * len(BENDS)):
+            share, length = (
+                BENDS[next_move % len(BENDS)],
+                STEP_M if next_move < len(BENDS) else -STEP_M,
+            )
             x, y, yaw, cost = drive(terrain, car, here, share / car.radius, length, needs)
             if cost == math.inf:
                 continue
             if move >= 0:
-                cost = _add_change_cost(cost, move, to)
+                cost = _add_change_cost(cost, move, next_move)
             key = _bin(terrain, x, y, yaw)
             slot = _slot(table, key)
-            other, total, known = table[slot, 1], g[node] + cost, table[slot, 0] == key
-            if known and (link[other, 2] or g[other] <= total):
+            other, total, seen = table[slot, 1], g[node] + cost, table[slot, 0] == key
+            if seen and (link[other, 2] or g[other] <= total):
                 continue
-            _set_node(memory, count, (x, y, yaw), total, node, to)
-            if known:
+            _set_node(memory, count, (x, y, yaw), total, node, next_move)
+            if seen:
                 link[other, 2] = 1  # this one is cheaper
             table[slot, 0], table[slot, 1] = key, count
             _push(heap, size, total + _estimate(terrain, car, (x, y, yaw), goal), count)

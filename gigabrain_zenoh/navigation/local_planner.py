@@ -289,7 +289,10 @@ class LocalPlanner:
 
     def _start(self, request: PlanRequest, place: Pose2D) -> InitialState:
         v, sent, dt = request.velocity, request.sent, self._sampler.dt
-        times = [((one.tick - request.tick) * TICK_S, *_twist_tuple(one.velocity)) for one in sent]
+        times = [
+            ((command.tick - request.tick) * TICK_S, *_twist_tuple(command.velocity))
+            for command in sent
+        ]
         rows = np.array([row for row in times if row[0] <= 0.0]).reshape(-1, 4)
         gain = request.response.turn_gain
         rows[:, 3] *= gain  # as the floor changes it; control corrects future commands only

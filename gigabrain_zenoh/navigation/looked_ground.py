@@ -81,7 +81,9 @@ class LookedGround:
         The corner of the window is at (x, y) [m]. Polygons `outlines` (n, 2) [m] hide the ground
         behind them.
         """
-        seeing = [one for one in self._body.cameras if one.name in cameras and one.depth]
+        seeing = [
+            camera for camera in self._body.cameras if camera.name in cameras and camera.depth
+        ]
         if not seeing and not self._has_looked:
             return
         self._move_window(round(y / CELL_M), round(x / CELL_M))

@@ -206,21 +206,23 @@ def make_feasible(model: MotionModel, start: InitialState, dt: float, plans: Flo
     turning = model.turning * min(1.0, start.gain)
     flat = plans.reshape(-1)
     for t in range(plans.shape[0] if model.strafes else 0):  # in its own loop: it is slow
-        one = flat[t * COMMAND : (t + 1) * COMMAND]
+        command = flat[t * COMMAND : (t + 1) * COMMAND]
         for lane in range(LANES):
-            slower = limit_slanted(model, one[lane], one[LANES + lane])
-            one[lane], one[LANES + lane] = slower
+            slower = limit_slanted(model, command[lane], command[LANES + lane])
+            command[lane], command[LANES + lane] = slower
     for lane in range(LANES):
         wanted = max(-turning, min(turning, flat[2 * LANES + lane]))
         first = feasible(model, start.before, (flat[lane], flat[LANES + lane], wanted), dt)
         flat[lane], flat[LANES + lane], flat[2 * LANES + lane] = first
     for t in range(1, plans.shape[0]):
-        two = flat[(t - 1) * COMMAND : (t + 1) * COMMAND]
+        pair = flat[(t - 1) * COMMAND : (t + 1) * COMMAND]
         for lane in range(LANES):
-            before = two[lane], two[LANES + lane], two[2 * LANES + lane]
-            wanted = max(-turning, min(turning, two[SECOND_TURN + lane]))
-            then = feasible(model, before, (two[SECOND_X + lane], two[SECOND_Y + lane], wanted), dt)
-            two[SECOND_X + lane], two[SECOND_Y + lane], two[SECOND_TURN + lane] = then
+            before = pair[lane], pair[LANES + lane], pair[2 * LANES + lane]
+            wanted = max(-turning, min(turning, pair[SECOND_TURN + lane]))
+            second = feasible(
+                model, before, (pair[SECOND_X + lane], pair[SECOND_Y + lane], wanted), dt
+            )
+            pair[SECOND_X + lane], pair[SECOND_Y + lane], pair[SECOND_TURN + lane] = second
 
 
 @lean_kernel

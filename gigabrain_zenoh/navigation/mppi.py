@@ -100,8 +100,8 @@ def fill_plans(
             for lane in range(LANES):
                 plan[lane] = last[t, axis] + disturbed[lane]
             for lane in range(0, LANES, SIMPLE_EVERY):
-                one = simple[lane]
-                plan[lane] = one[axis] if t < one[6] else one[3 + axis]
+                twists = simple[lane]
+                plan[lane] = twists[axis] if t < twists[6] else twists[3 + axis]
             if first:
                 plan[0], plan[BRAKING_LANE] = last[t, axis], 0.0
 
@@ -242,7 +242,7 @@ def _evaluate(
 ) -> None:  # fmt: skip
     """Fill `states`, and `costs` (n,) of the first lanes of feasible `plans` (T, 3, LANES).
 
-    A cost is inf if it reaches `limit`, or is worthless compared with an earlier lane. With a
+    A cost may be inf if it reaches `limit`, or is worthless compared with an earlier lane. With a
     limit of inf, all costs are exact, and `rooms` are filled as well.
     """
     simulate(problem.model, problem.outline.far, start, problem.dt, plans, states)
@@ -288,17 +288,17 @@ def _combine(
     for n in range(len(origins)):
         if costs[n // LANES, n % LANES] < costs[best_plan // LANES, best_plan % LANES]:
             best_plan = n
-    least = costs[best_plan // LANES, best_plan % LANES]
+    least_cost = costs[best_plan // LANES, best_plan % LANES]
     combined[:] = 0.0
     for n in range(len(origins)):
-        worse = costs[n // LANES, n % LANES] - least
-        if worse < WORTHLESS_MARGIN:
-            share = math.exp(-worse / TEMPERATURE)
-            total += share
+        excess = costs[n // LANES, n % LANES] - least_cost
+        if excess < WORTHLESS_MARGIN:
+            weight = math.exp(-excess / TEMPERATURE)
+            total += weight
             for t in range(plans.shape[1]):
                 for axis in range(plans.shape[2]):
-                    one = plans[n // LANES, t, axis, n % LANES]
-                    combined[t, axis, origins[n]] += share * one
+                    command = plans[n // LANES, t, axis, n % LANES]
+                    combined[t, axis, origins[n]] += weight * command
     for t in range(plans.shape[1]):
         for axis in range(plans.shape[2]):
             sums, amount = combined[t, axis], 0.0

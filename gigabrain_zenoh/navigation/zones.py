@@ -89,9 +89,9 @@ class ZoneMap:
 
     def __init__(self, zones: Iterable[Zone]) -> None:
         areas = [_area(zone) for zone in zones]
-        self.keepouts = [one for one in areas if one.zone.kind == "keepout"]
-        self.speeds = [one for one in areas if one.zone.kind == "speed"]
-        self.lanes = [one for one in areas if one.zone.kind == "one_way"]
+        self.keepouts = [area for area in areas if area.zone.kind == "keepout"]
+        self.speeds = [area for area in areas if area.zone.kind == "speed"]
+        self.lanes = [area for area in areas if area.zone.kind == "one_way"]
 
     @property
     def empty(self) -> bool:
