@@ -45,24 +45,24 @@ RECENTER_SHARE = 0.05  # of the window, distance of the robot from its middle be
 
 
 class Chamfer:
-    """Distances in windows of (side, side) cells of size `cell` [m], `most` [m] at most."""
+    """Distances in windows of (side, side) cells of size `cell` [m], `limit` [m] at most."""
 
-    def __init__(self, side: int, cell: float, most: float) -> None:
+    def __init__(self, side: int, cell: float, limit: float) -> None:
         self._steps = np.full(
             (side + 2 * RIM_CELLS, side + 2 * RIM_CELLS), UNREACHED, dtype=np.int32
         )
-        self._cell, self._most = cell, most
+        self._cell, self._limit = cell, limit
 
     def distance(self, free: FreeCells) -> Singles:
         """Return the distance of each cell's centre to that of the nearest 0 in `free` [m]."""
         distance = np.empty(free.shape, dtype=np.float32)
-        _chamfer(free, self._steps, np.float32(self._cell), np.float32(self._most), distance)
+        _chamfer(free, self._steps, np.float32(self._cell), np.float32(self._limit), distance)
         return distance
 
 
 @kernel
 def _chamfer(
-    free: FreeCells, steps: Steps, cell: np.float32, most: np.float32, distance: Singles
+    free: FreeCells, steps: Steps, cell: np.float32, limit: np.float32, distance: Singles
 ) -> None:
     """Fill `distance`, by steps within rows first, then from row to row."""
     rows, columns = free.shape
@@ -77,7 +77,7 @@ def _chamfer(
         _lower_from_rows(steps[row + RIM_CELLS + 1], steps[row + RIM_CELLS + 2], here)
         for column in range(columns):
             away = np.float32(here[column]) * unit * cell
-            out[column] = away if away < most else most
+            out[column] = away if away < limit else limit
 
 
 @lean_kernel
