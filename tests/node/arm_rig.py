@@ -1,4 +1,4 @@
-"""An arm in MuJoCo with a queue of tasks, stepped in memory, for the tests of missions."""
+"""An arm in MuJoCo with a task queue, stepped in memory, for tests of missions."""
 
 from collections.abc import Callable
 from concurrent.futures import Future
@@ -41,7 +41,7 @@ def waits(job: Future[Any], _patience_s: float) -> bool:
 
 
 class Rig:
-    """An arm with a queue of tasks."""
+    """An arm with a task queue."""
 
     def __init__(
         self,
@@ -67,8 +67,8 @@ class Rig:
         self.start(Saved())
         self.held = ""
         self.seen: tuple[SeenSolid, ...] = ()
-        self.phases: list[str] = []  # that it was in, each time it began
-        self.plans: list[ArmPlan] = []  # that were published
+        self.phases: list[str] = []  # in the order in which they began
+        self.plans: list[ArmPlan] = []  # published ones
 
     def start(self, saved: Saved) -> None:
         """Start decision."""
@@ -81,7 +81,7 @@ class Rig:
         return lambda: None
 
     def restart(self) -> None:
-        """Have decision die, and start it again with its file."""
+        """Stop decision, and start it again with its task file."""
         self.manipulator.close()
         saved = msgspec.json.decode(msgspec.json.encode(self.queue.saved), type=Saved)
         for _ in range(20):
@@ -108,19 +108,19 @@ class Rig:
         self.arm.step(intent)
 
     def take_away(self, to: tuple[float, float] = (0.5, 0.5)) -> None:
-        """Have what the gripper holds be somewhere else."""
+        """Move the held thing somewhere else."""
         simulation = self.arm.simulation
         joint = simulation.model.body("world/thing").jntadr[0]
         at = simulation.model.jnt_qposadr[joint]
         simulation.data.qpos[at : at + 7] = *to, 0.015, 1.0, 0.0, 0.0, 0.0
 
     def carry_out(self, text: str) -> Task:
-        """Give a mission, and return what became of it."""
+        """Run a mission, and return its final state and reason."""
         self.give(text)
         return self.carry_on()
 
     def carry_on(self) -> Task:
-        """Return what becomes of the present task."""
+        """Wait for the end of the current task, and return its final state and reason."""
         for _ in range(MAX_TICKS):
             self.tick()
             if not self.queue.status.current:

@@ -1,4 +1,4 @@
-"""A body in a flat world of cells, in fake time: the decision node drives it, nothing else runs."""
+"""A simulated body in a flat world of cells, driven only by the decision node, in fake time."""
 
 import asyncio
 import functools
@@ -38,18 +38,18 @@ ROOM = """
 #.........#........#
 #.........#........#
 ####################
-"""  # a character is a quarter of a metre; the first line is the far one
+"""  # a character is 0.25 m; the first line has the largest y
 
 
 def drawn(picture: str, scale: int = 5) -> Cells:
-    """The cells of a picture, (height, width), the last line first."""
+    """Return the cells of a drawing, (height, width), with the last line first."""
     lines = picture.strip().splitlines()[::-1]
     rows = np.array([[PIXELS[c] for c in line] for line in lines], np.int8)
     return np.kron(rows, np.ones((scale, scale), np.int8))
 
 
 def as_map(cells: Cells, tick: int, boot: int) -> OccupancyGrid:
-    """The map of these cells, with the origin in the corner of the first."""
+    """Return the map of these cells, with its origin at the corner of the first cell."""
     height, width = cells.shape
     return OccupancyGrid(
         resolution=CELL, width=width, height=height, origin_x=0.0, origin_y=0.0,
@@ -70,26 +70,26 @@ class Plane:
         self.bench = NodeBench(functools.partial(decision.run, config))
         self.cells, self.known = cells, cells.copy()
         self.x, self.y, self.yaw = at
-        self.start = at  # where the odometry begins
+        self.start = at  # pose at the start of the odometry
         self.velocity, self.tick, self.localized = Velocity(), 0, True
         self.intent = Intent(behaviour="none", reason="")
-        self.intents: list[Intent] = []  # one a scan
+        self.intents: list[Intent] = []  # one per scan
         self.status = TaskStatus()
         self.gate = DRIVING
         self.travelled = 0.0
-        self.closest = math.inf  # [m], from the body's middle to anything
-        self.maps = True  # whether perception makes any
-        self.maps_sent = False  # and whether the last one has been sent
+        self.closest = math.inf  # [m], from the body's centre to an obstacle
+        self.maps = True  # perception publishes maps
+        self.maps_sent = False  # the newest map was sent
         self.boot, self.description = BOOT, WAFFLE
-        self.late_ticks = 0  # that worlds and places take on their way
+        self.late_ticks = 0  # transit time of world models and poses
         self._on_the_way: list[tuple[int, WorldModel, PoseInMap]] = []
 
     async def __aenter__(self) -> Self:
         await self.bench.__aenter__()
         await self.bench.ready()
         self.operator = Bus(self.bench.network.transport(), self.bench.clock, "operator")
-        self.operator.subscribe(INTENT, self._hear_intent)
-        self.operator.subscribe(TASK, self._hear_status)
+        self.operator.subscribe(INTENT, self._on_intent)
+        self.operator.subscribe(TASK, self._on_status)
         return self
 
     async def __aexit__(
@@ -102,12 +102,12 @@ class Plane:
         await self.bench.__aexit__(kind, error, traceback)
 
     async def go(self, seconds: float) -> None:
-        """Let so much time pass."""
+        """Let some seconds pass."""
         for _ in range(round(seconds * 50)):
             await self._tick()
 
     async def until(self, *states: str, seconds: float) -> None:
-        """Let time pass until the task that was done last ended in one of `states`."""
+        """Let time pass until a task ends, in one of `states`."""
         for _ in range(round(seconds * 50)):
             await self._tick()
             if not self.status.current and self.status.done:
@@ -116,7 +116,7 @@ class Plane:
         raise AssertionError(f"at ({self.x:.2f}, {self.y:.2f}): {self.intent.reason}")
 
     async def ask(self, service: Service[Q, R], request: Q) -> R:
-        """Ask the node, and return its reply. Time advances meanwhile."""
+        """Send a request, and return the reply. Time advances meanwhile."""
         asking = asyncio.ensure_future(self.operator.ask(service, request, timeout_s=30.0))
         while not asking.done():
             await self._tick()
@@ -124,16 +124,16 @@ class Plane:
         return asking.result()[0]
 
     async def ask_at_once(self, service: Service[Q, R], request: Q) -> R:
-        """The same, while time stands still."""
+        """Send a request while time stands still, and return the reply."""
         return (await self.operator.ask(service, request, timeout_s=30.0))[0]
 
     def driver_starts_anew(self) -> None:
-        """Ticks and odometry begin anew; the map and the place in it stay. No new map is sent."""
+        """Restart ticks and odometry; the map and the pose in it stay. No new map is sent."""
         self.boot, self.tick, self.start = self.boot + 1, 1, (self.x, self.y, self.yaw)
         self.velocity, self.maps_sent = Velocity(), True
 
     async def restart(self) -> None:
-        """End the node, and start it again."""
+        """Restart the node."""
         await self.bench.restart()
         await self.bench.ready()
 
@@ -160,12 +160,12 @@ class Plane:
                 bench.send(POSE, place)
         await bench.clock.advance(TICK_NS)
 
-    def _hear_intent(self, _key: str, intent: Intent) -> None:
+    def _on_intent(self, _key: str, intent: Intent) -> None:
         if intent.basis != self.intent.basis:
             self.intents.append(intent)
         self.intent = intent
 
-    def _hear_status(self, _key: str, status: TaskStatus) -> None:
+    def _on_status(self, _key: str, status: TaskStatus) -> None:
         self.status = status
 
     def _move(self) -> None:
@@ -211,7 +211,7 @@ class Plane:
         inside: NDArray[np.bool_],
         there: NDArray[np.bool_],
     ) -> None:
-        """Mark the cells that the beams have passed or hit as known."""
+        """Mark the cells that the beams passed or hit as known."""
         passed = inside & (np.cumsum(there, axis=1) - there == 0)
         r, c = rows[passed], columns[passed]
         self.known[r, c] = self.cells[r, c]

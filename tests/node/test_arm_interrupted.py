@@ -1,4 +1,4 @@
-"""Arm missions that are paused, or go on after another task, once the step has done its work."""
+"""Arm missions that are paused or interrupted by another task in the middle of a step."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -45,7 +45,7 @@ def preempt(rig: Rig, text: str) -> None:
 
 
 @pytest.mark.parametrize("other", ["", "do: [{posture: home}]"])
-def test_what_was_put_down_stays_put_down_for_a_step_that_goes_on(rig: Rig, other: str) -> None:
+def test_a_thing_put_down_stays_there_when_the_step_continues(rig: Rig, other: str) -> None:
     rig.give(PLACE)
     until(rig, "retreat")
     rig.tick()
@@ -59,7 +59,7 @@ def test_what_was_put_down_stays_put_down_for_a_step_that_goes_on(rig: Rig, othe
 
 
 @pytest.mark.parametrize("other", ["", "do: [{posture: home}]"])
-def test_what_was_pressed_is_not_pressed_again_by_a_step_that_goes_on(rig: Rig, other: str) -> None:
+def test_a_press_is_not_repeated_when_the_step_continues(rig: Rig, other: str) -> None:
     rig.give(PRESS)
     until(rig, "retreat")
     preempt(rig, other) if other else pause(rig)
@@ -69,7 +69,7 @@ def test_what_was_pressed_is_not_pressed_again_by_a_step_that_goes_on(rig: Rig, 
     assert rig.phases.count("press") == 1
 
 
-def test_a_pause_in_the_tick_in_which_a_step_is_done_loses_nothing(rig: Rig) -> None:
+def test_a_pause_in_the_tick_in_which_a_step_is_done_keeps_its_result(rig: Rig) -> None:
     rig.give(PLACE)
     until(rig, "retreat")
     while rig.outcome is None or rig.outcome.state == "running":
@@ -80,7 +80,7 @@ def test_a_pause_in_the_tick_in_which_a_step_is_done_loses_nothing(rig: Rig) -> 
 
 @pytest.mark.parametrize("cancelled", [False, True])
 @pytest.mark.parametrize("phase", ["descend", "close", "press"])
-def test_another_task_first_leaves_the_thing_that_the_hand_is_at(
+def test_another_task_backs_off_from_the_thing_at_the_hand(
     rig: Rig, phase: str, cancelled: bool
 ) -> None:
     rig.give(PRESS if phase == "press" else PLACE)
@@ -97,7 +97,7 @@ def test_another_task_first_leaves_the_thing_that_the_hand_is_at(
     assert rig.arm.thing()[:2] == pytest.approx(THERE, abs=0.01)
 
 
-def test_another_task_first_leaves_what_was_put_down(rig: Rig) -> None:
+def test_another_task_backs_off_from_the_thing_put_down(rig: Rig) -> None:
     rig.give(PLACE)
     until(rig, "retreat")
     rig.tick()
@@ -108,12 +108,10 @@ def test_another_task_first_leaves_what_was_put_down(rig: Rig) -> None:
 
 
 @pytest.mark.parametrize("cancelled", [False, True])
-def test_another_task_first_leaves_what_the_gripper_has_begun_to_let_go_of(
-    rig: Rig, cancelled: bool
-) -> None:
+def test_another_task_backs_off_from_the_thing_being_let_go(rig: Rig, cancelled: bool) -> None:
     rig.give(PLACE)
     until(rig, "lift")
-    pause(rig)  # at the place of a thing that it holds
+    pause(rig)  # at the target of the held thing
     until(rig, "traverse")
     until(rig, "open")
     for _ in range(15):
@@ -143,7 +141,7 @@ def test_a_thing_is_put_down_whenever_letting_go_is_interrupted(
     assert rig.arm.thing()[:2] == pytest.approx(ELSEWHERE, abs=0.012)
 
 
-def test_a_command_that_fails_at_a_thing_leaves_the_next_one_to_go_back(rig: Rig) -> None:
+def test_after_a_failure_at_a_thing_the_next_command_backs_off(rig: Rig) -> None:
     rig.give(PLACE)
     until(rig, "descend")
     rig.manipulator._hold_ups = HOLD_UPS
@@ -154,7 +152,7 @@ def test_a_command_that_fails_at_a_thing_leaves_the_next_one_to_go_back(rig: Rig
     assert rig.phases.index("retreat") < rig.phases.index("move")
 
 
-def test_a_way_back_that_is_interrupted_is_gone_on_with(rig: Rig) -> None:
+def test_an_interrupted_retreat_continues(rig: Rig) -> None:
     rig.give(PLACE)
     until(rig, "lift")
     rig.take_away()
@@ -166,7 +164,7 @@ def test_a_way_back_that_is_interrupted_is_gone_on_with(rig: Rig) -> None:
     assert "move" not in rig.phases
 
 
-def test_an_arm_whose_base_has_driven_off_does_not_go_back(rig: Rig) -> None:
+def test_an_arm_does_not_back_off_after_its_base_moved(rig: Rig) -> None:
     rig.give(PLACE)
     until(rig, "descend")
     rig.queue.cancel("", "ann")
@@ -178,9 +176,7 @@ def test_an_arm_whose_base_has_driven_off_does_not_go_back(rig: Rig) -> None:
 
 
 @pytest.mark.parametrize("paused", [False, True])
-def test_an_arm_that_an_operator_has_moved_away_from_a_thing_does_not_go_back(
-    rig: Rig, paused: bool
-) -> None:
+def test_an_arm_does_not_back_off_after_an_operator_moved_it_away(rig: Rig, paused: bool) -> None:
     rig.give(PLACE)
     until(rig, "descend")
     rig.queue.pause("", "ann") if paused else rig.queue.cancel("", "ann")
@@ -198,7 +194,7 @@ def test_an_arm_that_an_operator_has_moved_away_from_a_thing_does_not_go_back(
         assert "retreat" not in rig.phases
 
 
-def test_a_thing_that_an_operator_takes_elsewhere_was_not_put_down_where_planned(rig: Rig) -> None:
+def test_a_thing_that_an_operator_moves_is_not_recorded_at_the_planned_place(rig: Rig) -> None:
     rig.give(PLACE)
     until(rig, "traverse")
     until(rig, "open")

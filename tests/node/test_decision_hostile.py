@@ -17,7 +17,7 @@ from gigabrain_zenoh.testing.waiting import settle
 from tests.node.plane import ROOM, Plane, as_map, drawn
 
 
-async def test_the_brains_own_commands_count_as_the_gate_lets_them_through() -> None:
+async def test_the_brains_own_commands_are_clamped_like_in_the_gate() -> None:
     net = Net()
     source = ContextSource(net.two, ZoneSource(net.two))
     for bus in (net.one, net.two):
@@ -48,7 +48,7 @@ def said(plane: Plane, topic: object) -> Message | None:
             return None
 
 
-async def test_no_extreme_stops_decision_and_it_reaches_its_goal_afterwards() -> None:
+async def test_decision_survives_extreme_messages_and_reaches_its_goal_afterwards() -> None:
     received = (BODY, topics.MAP, topics.STATE, topics.WORLD, topics.POSE, CMD_VEL, topics.SAFETY)
     async with Plane(drawn(ROOM)) as plane:
         await plane.go(0.2)

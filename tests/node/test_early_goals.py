@@ -1,4 +1,4 @@
-"""Goals that are given before the robot has got ready: taken at once, driven to afterwards."""
+"""Goals sent while the robot starts: they are accepted at once and reached afterwards."""
 
 import asyncio
 import functools
@@ -24,7 +24,7 @@ CELLS = drawn(ROOM)
 NAVIGATE = DecisionConfig(behaviour="navigate")
 
 
-async def test_a_goal_is_taken_while_decision_still_gets_ready(
+async def test_a_goal_is_accepted_while_decision_starts(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     warm = asyncio.Event()
@@ -51,7 +51,7 @@ async def test_a_goal_is_taken_while_decision_still_gets_ready(
         await operator.close()
 
 
-async def test_a_goal_that_was_given_before_there_was_a_map_is_driven_to() -> None:
+async def test_it_drives_to_a_goal_that_was_accepted_before_the_first_map() -> None:
     async with Plane(CELLS) as plane:
         reply = await plane.ask_at_once(GOAL, GoalRequest(x=4.0, y=0.8))
         assert reply.text == f"goal-1: accepted; {WaitReason.PERCEPTION_STARTING}"
@@ -60,9 +60,7 @@ async def test_a_goal_that_was_given_before_there_was_a_map_is_driven_to() -> No
         await plane.until("succeeded", seconds=60)
 
 
-async def test_a_goal_in_a_wall_that_was_given_before_there_was_a_map_fails_with_the_reason() -> (
-    None
-):
+async def test_a_goal_in_a_wall_accepted_before_the_first_map_fails_with_the_reason() -> None:
     async with Plane(CELLS) as plane:
         assert (await plane.ask_at_once(GOAL, GoalRequest(x=2.6, y=0.5))).ok
         await plane.until("failed", seconds=2)
@@ -71,7 +69,7 @@ async def test_a_goal_in_a_wall_that_was_given_before_there_was_a_map_fails_with
         assert plane.travelled == 0.0
 
 
-async def test_a_goal_waits_until_it_is_sure_for_the_first_time_where_it_is() -> None:
+async def test_a_goal_waits_for_the_first_localization() -> None:
     async with Plane(CELLS) as plane:
         plane.localized = False
         await plane.go(0.3)
@@ -86,7 +84,7 @@ async def test_a_goal_waits_until_it_is_sure_for_the_first_time_where_it_is() ->
         await plane.until("succeeded", seconds=60)
 
 
-async def test_what_is_missing_is_named_with_what_to_install(
+async def test_a_missing_package_is_named_with_the_command_to_install_it(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     for name in ("gigabrain_zenoh.kernels.jit", "numba"):

@@ -1,4 +1,4 @@
-"""A base that drives keeps the grip of its arm."""
+"""The grip of an arm is kept while its base drives."""
 
 import asyncio
 from pathlib import Path
@@ -22,12 +22,12 @@ LEKIWI = load_robot("lekiwi")
 assert LEKIWI.arm
 HOME = LEKIWI.arm.home
 GRIPPER = LEKIWI.joints[-1]
-WIDTH = 0.8  # [rad], where a thing stops the gripper
+WIDTH = 0.8  # [rad], position where a thing stops the gripper
 GRIP = WIDTH - STILL[1] * (GRIPPER.upper - GRIPPER.lower)
 
 
 class Carrier(Plane):
-    """A body with LeKiwi's arm, whose joints are at once where they are sent."""
+    """A body with LeKiwi's arm, whose joints reach their targets at once."""
 
     def __init__(self, config: DecisionConfig | None = None) -> None:
         super().__init__(drawn(ROOM), config=config)
@@ -39,7 +39,7 @@ class Carrier(Plane):
 
     @property
     def lag(self) -> float:
-        """The distance of the gripper from where it was sent, as a share of its range."""
+        """The lag of the gripper, as a share of its range."""
         return (self.width - self.sent[GRIPPER.name]) / (GRIPPER.upper - GRIPPER.lower)
 
     def _with_joints(self, topic: Topic[Any], message: Any) -> None:
@@ -55,7 +55,7 @@ class Carrier(Plane):
 
 
 @pytest.mark.parametrize("creeps", [-0.01, 0.01])
-async def test_a_grip_follows_what_creeps_while_the_base_drives(creeps: float) -> None:
+async def test_a_grip_follows_a_creeping_thing_while_the_base_drives(creeps: float) -> None:
     async with Carrier() as plane:
         mission = MissionRequest(mission="do: [{gripper: close}, {goto: [4.0, 0.8]}]")
         assert (await plane.ask(MISSION, mission)).ok
@@ -68,7 +68,7 @@ async def test_a_grip_follows_what_creeps_while_the_base_drives(creeps: float) -
 
 
 @pytest.mark.parametrize("creeps", [-0.01, 0.01])
-async def test_a_grip_is_followed_after_a_restart_of_decision(
+async def test_a_grip_is_adjusted_after_a_restart_of_decision(
     tmp_path: Path, creeps: float
 ) -> None:
     async with Carrier(DecisionConfig(behaviour="navigate", state_dir=str(tmp_path))) as plane:
@@ -82,7 +82,7 @@ async def test_a_grip_is_followed_after_a_restart_of_decision(
         assert STILL[0] < plane.lag < STILL[-1]
 
 
-async def test_what_gripper_close_grips_is_kept_over_a_restart_of_decision(tmp_path: Path) -> None:
+async def test_a_grip_by_gripper_close_survives_a_restart_of_decision(tmp_path: Path) -> None:
     async with Carrier(DecisionConfig(behaviour="navigate", state_dir=str(tmp_path))) as plane:
         mission = MissionRequest(mission="do: [{gripper: close}, {goto: [4.0, 0.8]}]")
         assert (await plane.ask(MISSION, mission)).ok
@@ -95,7 +95,7 @@ async def test_what_gripper_close_grips_is_kept_over_a_restart_of_decision(tmp_p
         assert STILL[0] < plane.lag < STILL[-1]
 
 
-async def test_what_is_held_is_not_forgotten_while_an_arm_gets_ready(tmp_path: Path) -> None:
+async def test_a_held_thing_is_remembered_while_the_arm_starts(tmp_path: Path) -> None:
     config = DecisionConfig(behaviour="navigate", state_dir=str(tmp_path))
     async with Carrier(config) as plane:
         await restart(plane, tmp_path)
@@ -108,7 +108,7 @@ async def test_what_is_held_is_not_forgotten_while_an_arm_gets_ready(tmp_path: P
 
 
 async def restart(plane: Carrier, folder: Path) -> None:
-    """Have decision start with a file that says that the gripper holds a can."""
+    """Start decision with a task file in which the gripper holds a can."""
     plane.sent[GRIPPER.name] = GRIP
     can = Solid(cylinder=(0.03, 0.1), at=(0.0, 0.0, 0.0))
     axes = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
@@ -118,8 +118,8 @@ async def restart(plane: Carrier, folder: Path) -> None:
 
 
 async def drive(plane: Carrier, way: float) -> None:
-    """Let time pass until the base has driven so far [m]."""
+    """Let time pass until the base drove so far [m]."""
     while plane.travelled < way:
         await plane.go(0.1)
-        await asyncio.sleep(0.01)  # in which a worker thread loads what arms need, and plans
+        await asyncio.sleep(0.01)  # for the worker thread that loads the arm's kernels and plans
     assert plane.status.current

@@ -1,4 +1,4 @@
-"""At the first start of an installation a robot drives while its kernels still compile."""
+"""At the first start of an installation, a robot drives while its kernels compile."""
 
 import asyncio
 
@@ -29,11 +29,11 @@ EXPLORES = DecisionConfig(behaviour="navigate", settings={"start": "explore"})
 
 
 class Compiler:
-    """Stands in for the child that compiles."""
+    """A fake of the child process that compiles."""
 
     def __init__(self) -> None:
         self.may_end, self.began = asyncio.Event(), 0
-        self.kills = 0  # of the next children
+        self.kills = 0  # number of next children to be killed
         self.compiled: list[str] = []
         self._loaded, self._loop = asyncio.Event(), asyncio.get_running_loop()
 
@@ -52,7 +52,7 @@ class Compiler:
         self._loop.call_soon_threadsafe(self._loaded.set)
 
     async def end(self) -> None:
-        """Let it end, and wait until the kernels are loaded."""
+        """End the child, and wait until the kernels are loaded."""
         self.may_end.set()
         await self._loaded.wait()
         await asyncio.sleep(0.01)
@@ -80,7 +80,7 @@ async def test_it_roams_without_a_map_and_then_explores_by_itself(compiler: Comp
         assert plane.status.current is None
         await compiler.end()
         await plane.go(1.0)
-        assert plane.intent.behaviour == "avoid"  # until perception has a map, too
+        assert plane.intent.behaviour == "avoid"  # until perception also has a map
         plane.maps = True
         await plane.go(3.0)
         assert plane.intent.behaviour == "navigate"
@@ -110,7 +110,7 @@ async def test_a_robot_that_waits_for_tasks_stands_meanwhile(compiler: Compiler)
         await plane.until("succeeded", seconds=60)
 
 
-async def test_it_does_not_roam_for_ever_where_nobody_makes_a_map(compiler: Compiler) -> None:
+async def test_it_does_not_roam_for_ever_without_a_map(compiler: Compiler) -> None:
     async with Plane(CELLS, config=EXPLORES) as plane:
         plane.maps = False
         await plane.go(0.2)
@@ -119,7 +119,7 @@ async def test_it_does_not_roam_for_ever_where_nobody_makes_a_map(compiler: Comp
         assert WaitReason.NO_LOCALIZATION in plane.intent.reason
 
 
-async def test_whoever_roams_obeys_a_speed_limit(compiler: Compiler) -> None:
+async def test_a_roaming_robot_obeys_the_speed_limit(compiler: Compiler) -> None:
     slow = {"start": "explore", "max_linear_speed": 0.05}
     config = DecisionConfig(behaviour="navigate", settings=slow)
     async with Plane(CELLS, config=config) as plane:
@@ -127,7 +127,7 @@ async def test_whoever_roams_obeys_a_speed_limit(compiler: Compiler) -> None:
         assert 0.1 < plane.travelled < 0.21
 
 
-async def test_in_lock_step_all_is_compiled_first(compiler: Compiler) -> None:
+async def test_in_lock_step_all_kernels_are_compiled_first(compiler: Compiler) -> None:
     compiler.may_end.set()
     config = DecisionConfig(behaviour="navigate", compile_first=True)
     async with Plane(CELLS, config=config) as plane:
@@ -158,7 +158,7 @@ async def test_perception_with_a_saved_map_compiles_first(compiler: Compiler) ->
     assert compiler.compiled
 
 
-async def test_a_package_that_is_missing_is_named(
+async def test_a_missing_package_is_named(
     compiler: Compiler, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def nothing(_: str) -> None:
@@ -184,7 +184,7 @@ async def test_a_car_has_its_own_kernels_compiled_once_it_is_known(compiler: Com
         assert compiler.compiled == [DRIVE_KERNELS, CAR_KERNELS]
 
 
-async def test_in_lock_step_those_of_cars_are_compiled_first_too(compiler: Compiler) -> None:
+async def test_in_lock_step_kernels_of_cars_are_compiled_first_too(compiler: Compiler) -> None:
     compiler.may_end.set()
     kernels = DriveKernels(InputLogger().in_time)
     assert await kernels.load(wait=True)
@@ -192,7 +192,7 @@ async def test_in_lock_step_those_of_cars_are_compiled_first_too(compiler: Compi
 
 
 @pytest.mark.parametrize(("kills", "said"), [(1, ["compiled"]), (2, [])])
-async def test_a_child_that_is_killed_while_it_compiles_starts_once_more(
+async def test_a_child_that_is_killed_while_it_compiles_is_started_again(
     compiler: Compiler,
     monkeypatch: pytest.MonkeyPatch,
     caplog: pytest.LogCaptureFixture,

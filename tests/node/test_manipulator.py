@@ -28,7 +28,7 @@ from tests.node.arm_rig import ELSEWHERE, THERE, THINGS, Rig
 
 NO_TASK = Idle("idle", "no task")
 GRIPPER = load_robot("so101").joints[-1]
-SOON = 150  # ticks, within which a grip has been set again
+SOON = 150  # ticks, enough to adjust a grip
 
 
 @pytest.fixture
@@ -69,7 +69,7 @@ def test_the_demo_of_any_arm_moves_blocks_and_heats_no_motor(tmp_path: Path, bod
 @pytest.mark.slow
 @pytest.mark.parametrize("steps", ["{pick: cube}", "{pick: cube}, {gripper: close}"])
 @pytest.mark.parametrize("body", ["so101", "piper"])
-def test_what_an_arm_holds_heats_no_motor_however_long(
+def test_holding_a_thing_for_long_does_not_heat_a_motor(
     tmp_path: Path, body: str, steps: str
 ) -> None:
     rig = Rig(tmp_path, body=body)
@@ -85,7 +85,7 @@ def test_what_an_arm_holds_heats_no_motor_however_long(
 
 
 @pytest.mark.parametrize("way", [-0.01, 0.01])
-def test_a_grip_follows_what_creeps_while_the_arm_is_still(rig: Rig, way: float) -> None:
+def test_a_grip_follows_a_creeping_thing_while_the_arm_rests(rig: Rig, way: float) -> None:
     assert rig.carry_out(THINGS + "do: [{pick: cube}]").state == "succeeded"
     for _ in range(SOON):
         rig.tick()
@@ -101,7 +101,7 @@ def test_a_grip_follows_what_creeps_while_the_arm_is_still(rig: Rig, way: float)
     assert outcome.holds.grip == target.position
 
 
-def test_a_gripper_that_an_operator_has_moved_stays_there(rig: Rig) -> None:
+def test_a_gripper_moved_by_an_operator_stays_there(rig: Rig) -> None:
     assert rig.carry_out(THINGS + "do: [{pick: cube}]").state == "succeeded"
     for _ in range(SOON):
         rig.tick()
@@ -117,7 +117,7 @@ def test_a_grip_is_firmer_while_the_arm_moves(rig: Rig) -> None:
     for _ in range(SOON):
         rig.tick()
     rig.give("do: [{place: [0.1388, 0.15, 0.015]}]")
-    lags = dict[str, float]()  # by phases, at their ends
+    lags = dict[str, float]()  # by phase, at its end
     while rig.queue.status.current:
         rig.tick()
         state = rig.arm.state()
@@ -128,7 +128,7 @@ def test_a_grip_is_firmer_while_the_arm_moves(rig: Rig) -> None:
 
 
 @pytest.mark.slow
-def test_safety_near_the_table_bends_no_way_of_the_piper_to_a_block(tmp_path: Path) -> None:
+def test_safety_near_the_table_does_not_change_the_pipers_paths(tmp_path: Path) -> None:
     rig = Rig(tmp_path, body="piper", world=Path("table"))
     rig.give(Path(mission_file("blocks", tmp_path)).read_text())
     shape = MujocoArm(robot_path("piper").with_name("model.xml").read_text(), rig.arm.description)
@@ -138,7 +138,7 @@ def test_safety_near_the_table_bends_no_way_of_the_piper_to_a_block(tmp_path: Pa
         memory, verdict = step(rig.arm.description, memory, inputs)
         rig.arm.caps = verdict.joints
         rig.tick()
-        if rig.phases[-1] == "descend":  # a finger on a block is forced open
+        if rig.phases[-1] == "descend":  # a finger that touches a block is forced open
             (sent,) = rig.arm.posture(["gripper"])
             forced.append(abs(rig.arm.measured("gripper") - sent))
     assert max(forced) < 0.0005
@@ -163,7 +163,7 @@ def test_the_tool_reaches_a_point_from_the_asked_direction(rig: Rig) -> None:
         ("pick: far", "too far by"),
     ],
 )
-def test_what_cannot_be_done_fails_with_its_reason_and_nothing_moves(
+def test_an_impossible_command_fails_with_its_reason_and_without_motion(
     rig: Rig, step: str, why: str
 ) -> None:
     far = "things: {far: {sphere: 0.015, at: [0.8, 0.0, 0.015]}}\n"
@@ -174,7 +174,7 @@ def test_what_cannot_be_done_fails_with_its_reason_and_nothing_moves(
     assert rig.arm.posture(rig.arm.arm.names) == pytest.approx(before, abs=1e-3)
 
 
-def test_what_is_not_there_is_tried_three_times_and_the_arm_goes_back(tmp_path: Path) -> None:
+def test_a_missing_thing_is_tried_three_times_and_the_arm_backs_off(tmp_path: Path) -> None:
     rig = Rig(tmp_path, cube=(-0.3, 0.3))
     task = rig.carry_out(THINGS + "do: [{pick: cube}]")
     assert (task.state, task.reason) == ("failed", "picking up cube: it was not caught, 3 times")
@@ -183,7 +183,7 @@ def test_what_is_not_there_is_tried_three_times_and_the_arm_goes_back(tmp_path: 
 
 
 @pytest.mark.parametrize("phase", ["descend", "close", "lift", "traverse", "open", "retreat"])
-def test_after_an_interruption_it_goes_on_from_where_it_is(rig: Rig, phase: str) -> None:
+def test_after_an_interruption_it_continues_from_its_posture(rig: Rig, phase: str) -> None:
     rig.give(THINGS + "do: [{pick: cube}, {place: [0.1388, 0.15, 0.015]}]")
     while rig.outcome is None or rig.outcome.reason != phase:
         rig.tick()
@@ -199,14 +199,14 @@ def test_after_an_interruption_it_goes_on_from_where_it_is(rig: Rig, phase: str)
 
 
 @pytest.mark.parametrize("phase", ["descend", "squeeze", "lift", "traverse", "lower", "retreat"])
-def test_after_a_restart_of_decision_it_goes_on_with_what_it_holds(rig: Rig, phase: str) -> None:
+def test_after_a_restart_of_decision_it_continues_with_the_held_thing(rig: Rig, phase: str) -> None:
     rig.give(THINGS + "do: [{pick: cube}, {place: [0.1388, 0.15, 0.015]}]")
     while rig.outcome is None or rig.outcome.reason != phase:
         rig.tick()
     rig.tick()
     rig.restart()
     task = rig.carry_on()
-    if phase == "retreat":  # it has let go already
+    if phase == "retreat":  # the gripper has already let go
         assert task.state == "failed"
         assert task.reason.endswith("the gripper holds nothing")
     else:
@@ -215,7 +215,7 @@ def test_after_a_restart_of_decision_it_goes_on_with_what_it_holds(rig: Rig, pha
 
 
 @pytest.mark.parametrize("phase", ["descend", "traverse"])
-def test_another_speed_limit_of_the_body_does_not_lose_what_it_holds(rig: Rig, phase: str) -> None:
+def test_another_speed_limit_of_the_body_keeps_the_held_thing(rig: Rig, phase: str) -> None:
     rig.give(THINGS + "do: [{pick: cube}, {place: [0.1388, 0.15, 0.015]}]")
     while rig.outcome is None or rig.outcome.reason != phase:
         rig.tick()
@@ -225,7 +225,7 @@ def test_another_speed_limit_of_the_body_does_not_lose_what_it_holds(rig: Rig, p
     assert rig.arm.thing()[:2] == pytest.approx(ELSEWHERE, abs=0.012)
 
 
-def test_after_a_restart_things_are_where_they_were_put(rig: Rig) -> None:
+def test_after_a_restart_things_are_at_their_new_places(rig: Rig) -> None:
     rig.give(
         THINGS + "do: [{pick: cube}, {place: [0.1388, 0.15, 0.015]}, {posture: home}, {pick: cube}]"
     )
@@ -237,7 +237,7 @@ def test_after_a_restart_things_are_where_they_were_put(rig: Rig) -> None:
 
 
 @pytest.mark.parametrize("opened", [False, True])
-def test_what_was_lost_during_a_restart_is_not_believed(rig: Rig, opened: bool) -> None:
+def test_a_thing_lost_during_a_restart_is_not_held(rig: Rig, opened: bool) -> None:
     rig.give(THINGS + "do: [{pick: cube}, {place: [0.1388, 0.15, 0.015]}]")
     while rig.outcome is None or rig.outcome.reason != "traverse":
         rig.tick()
@@ -256,9 +256,7 @@ def test_what_was_lost_during_a_restart_is_not_believed(rig: Rig, opened: bool) 
 
 
 @pytest.mark.parametrize("lost", [False, True])
-def test_what_gripper_close_grips_is_believed_after_a_restart_if_it_is_still_there(
-    rig: Rig, lost: bool
-) -> None:
+def test_a_grip_by_gripper_close_is_restored_if_it_still_holds(rig: Rig, lost: bool) -> None:
     assert rig.carry_out(THINGS + "do: [{pick: cube}, {gripper: close}]").state == "succeeded"
     for _ in range(SOON):
         rig.tick()
@@ -288,13 +286,13 @@ def test_a_model_that_cannot_be_used_fails_the_command_in_one_line(tmp_path: Pat
     rig.manipulator.close()
 
 
-def test_a_gripper_that_is_late_is_not_taken_for_one_that_holds_something(tmp_path: Path) -> None:
+def test_a_slow_gripper_does_not_count_as_holding(tmp_path: Path) -> None:
     rig = Rig(tmp_path, cube=(-0.3, 0.3))
     rig.give(THINGS + "do: [{pick: cube}]")
     while rig.outcome is None or rig.outcome.reason != "close":
         rig.tick()
     late = rig.arm.state
-    for _ in range(60):  # its state shows a gripper that still closes
+    for _ in range(60):  # the state shows a gripper that still closes
         rig.tick()
         moving = replace(late().joints[-1], velocity=-1.0)
         rig.arm.state = lambda m=moving: replace(late(), joints=(*late().joints[:-1], m))  # type: ignore[method-assign, misc]
@@ -305,7 +303,7 @@ def test_a_gripper_that_is_late_is_not_taken_for_one_that_holds_something(tmp_pa
     rig.manipulator.close()
 
 
-def test_what_slips_out_of_the_gripper_is_reported(rig: Rig) -> None:
+def test_a_thing_that_slips_out_of_the_gripper_is_reported(rig: Rig) -> None:
     rig.give(THINGS + "do: [{pick: cube}, {place: [0.1388, 0.15, 0.015]}]")
     while rig.outcome is None or rig.outcome.reason != "traverse":
         rig.tick()
@@ -315,7 +313,7 @@ def test_what_slips_out_of_the_gripper_is_reported(rig: Rig) -> None:
     assert "cube has slipped out of the gripper" in task.reason
 
 
-def test_a_second_thing_is_not_taken_for_the_one_that_it_holds(
+def test_a_second_thing_does_not_count_as_the_held_one(
     rig: Rig, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     missions: list[str] = []
@@ -329,7 +327,7 @@ def test_a_second_thing_is_not_taken_for_the_one_that_it_holds(
     assert task.reason.endswith("the gripper holds the thing at (0.239, 0.000, 0.015) already")
 
 
-def test_a_posture_that_does_not_open_the_gripper_says_so(rig: Rig) -> None:
+def test_a_posture_that_cannot_open_the_gripper_reports_that(rig: Rig) -> None:
     assert rig.carry_out(THINGS + "do: [{pick: cube}]").state == "succeeded"
     assert rig.carry_out("do: [{posture: home}]").reason == "it holds cube"
     task = rig.carry_out("do: [{posture: {shoulder_pan: 0.2, gripper: 1.0}}]")
@@ -345,7 +343,7 @@ def test_a_posture_that_does_not_open_the_gripper_says_so(rig: Rig) -> None:
 
 
 @pytest.mark.parametrize("wide", [0.01, 0.05, 1.0])
-def test_what_an_operator_has_let_go_of_is_not_put_down(rig: Rig, wide: float) -> None:
+def test_a_thing_released_by_an_operator_is_not_put_down(rig: Rig, wide: float) -> None:
     assert rig.carry_out(THINGS + "do: [{pick: cube}]").state == "succeeded"
     for _ in range(SOON):
         rig.tick()
@@ -361,7 +359,7 @@ def test_what_an_operator_has_let_go_of_is_not_put_down(rig: Rig, wide: float) -
 
 
 @pytest.mark.parametrize("step", ["place: [0.1388, 0.15, 0.015]", "posture: home"])
-def test_what_is_lost_before_the_arm_moves_on_is_reported(rig: Rig, step: str) -> None:
+def test_a_thing_lost_before_the_next_motion_is_reported(rig: Rig, step: str) -> None:
     assert rig.carry_out(THINGS + "do: [{pick: cube}]").state == "succeeded"
     for _ in range(SOON):
         rig.tick()
@@ -375,7 +373,7 @@ def test_what_is_lost_before_the_arm_moves_on_is_reported(rig: Rig, step: str) -
 
 
 @pytest.mark.slow
-def test_a_gripper_that_safety_holds_back_is_not_taken_for_one_that_holds_something(
+def test_a_gripper_held_back_by_safety_does_not_count_as_holding(
     rig: Rig,
 ) -> None:
     rig.arm.caps = (JointCap(name="gripper", fall=0.02),)
@@ -384,7 +382,7 @@ def test_a_gripper_that_safety_holds_back_is_not_taken_for_one_that_holds_someth
     assert rig.phases.count("close") == 3
 
 
-def test_what_is_lost_while_the_grip_eases_is_tried_again(rig: Rig) -> None:
+def test_a_thing_lost_while_the_grip_eases_is_picked_again(rig: Rig) -> None:
     rig.give(THINGS + "do: [{pick: cube}]")
     while rig.outcome is None or rig.outcome.reason != "squeeze":
         rig.tick()
@@ -406,7 +404,7 @@ def test_a_grip_that_squeezes_too_hard_still_is_eased_again(
         place = squeeze(self, measured, wanted, moving=moving)
         if moving:
             lags.append(abs(measured - wanted))
-        return wanted + 0.001 if moving and len(lags) == 1 else place  # it does not, at first
+        return wanted + 0.001 if moving and len(lags) == 1 else place  # the first one is too hard
 
     monkeypatch.setattr(ArmPlanner, "squeeze", squeezes)
     task = rig.carry_out(THINGS + "do: [{pick: cube}]")
@@ -434,11 +432,11 @@ def test_a_trajectory_waits_for_a_joint_that_safety_slows_down(rig: Rig) -> None
         rig.tick()
         apart = max(apart, abs(rig.arm.measured("shoulder_pan") - rig.arm.measured("wrist_roll")))
     assert rig.queue.status.done[0].state == "succeeded"
-    assert rig.phases.count("move") == 1  # no other way was planned
+    assert rig.phases.count("move") == 1  # it did not plan again
     assert apart < 0.3
 
 
-def test_what_safety_holds_back_for_long_ends_the_command_after_a_few_tries(rig: Rig) -> None:
+def test_a_command_held_back_by_safety_for_long_fails_after_a_few_tries(rig: Rig) -> None:
     rig.arm.caps = (JointCap(name="shoulder_pan", rise=0.0, fall=0.0),)
     task = rig.carry_out("do: [{posture: {shoulder_pan: 1.0}}]")
     assert task.state == "failed"
@@ -446,7 +444,7 @@ def test_what_safety_holds_back_for_long_ends_the_command_after_a_few_tries(rig:
     assert rig.phases.count("move") == 6
 
 
-def test_what_was_put_down_is_in_the_way_while_the_arm_hides_it(
+def test_a_thing_put_down_is_an_obstacle_while_the_arm_hides_it(
     rig: Rig, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     cube = SeenSolid(id=7, shape="box", size=(0.03, 0.03, 0.03), position=(*THERE, 0.015))
@@ -464,7 +462,7 @@ def test_what_was_put_down_is_in_the_way_while_the_arm_hides_it(
     )
     while rig.queue.status.current:
         rig.tick()
-        rig.seen = () if rig.phases[-1] == "lift" else rig.seen  # the camera sees it no more
+        rig.seen = () if rig.phases[-1] == "lift" else rig.seen  # hidden from the camera
     assert rig.queue.status.done[0].state == "succeeded"
     pick, _, home = known
     assert list(pick) == ["cube"]
@@ -472,7 +470,7 @@ def test_what_was_put_down_is_in_the_way_while_the_arm_hides_it(
     assert home["cube put down"].at == pytest.approx((*ELSEWHERE, 0.015), abs=0.01)
 
 
-def test_an_arm_that_seems_to_be_in_what_it_put_down_goes_on(rig: Rig) -> None:
+def test_an_arm_that_overlaps_the_thing_it_put_down_continues(rig: Rig) -> None:
     rig.seen = (SeenSolid(id=7, shape="box", size=(0.03, 0.03, 0.03), position=(*THERE, 0.015)),)
     rig.give(
         "things: {cube: {box: [0.03, 0.03, 0.03]}}\n"
@@ -491,7 +489,7 @@ FAR = "{box: [0.03, 0.03, 0.03]%s}"
 
 
 @pytest.mark.parametrize(("place", "goes"), [(", at: [0.9, 0, 0.015]", False), ("", True)])
-def test_a_body_that_drives_goes_to_what_is_seen_not_to_what_is_given(
+def test_a_body_that_drives_approaches_seen_things_but_not_given_ones(
     tmp_path: Path, place: str, goes: bool
 ) -> None:
     robot, driver = make_driver("lekiwi", Run(folder=Path()))

@@ -1,4 +1,4 @@
-"""Navigating by scans that come late, and with thoughts that take long."""
+"""Navigation with late scans and slow plans."""
 
 import time
 
@@ -23,7 +23,7 @@ CELLS = drawn(ROOM)
 STANDS = Velocity()
 
 
-async def test_it_stands_while_its_scans_come_too_late_to_drive_by() -> None:
+async def test_it_stands_while_its_scans_are_too_late() -> None:
     async with Plane(CELLS) as plane:
         await plane.go(0.2)
         await plane.ask_at_once(GOAL, GoalRequest(x=4.0, y=0.8))
@@ -36,7 +36,7 @@ async def test_it_stands_while_its_scans_come_too_late_to_drive_by() -> None:
             await plane.go(0.02)
             assert plane.intent.twist == STANDS
             said.add(plane.intent.reason)
-        # between two of these scans the older one no longer counts at all
+        # the older of two such scans is outdated before the next one arrives
         assert said == {
             "waiting: this host is too busy: its newest scan is 0.22 s old",
             "waiting: perception is silent",
@@ -46,7 +46,7 @@ async def test_it_stands_while_its_scans_come_too_late_to_drive_by() -> None:
         assert plane.intent.reason.startswith("going to (4.00, 0.80): ")
 
 
-async def test_it_drives_more_slowly_while_its_scans_come_late_and_says_why() -> None:
+async def test_it_drives_more_slowly_with_a_reason_while_its_scans_are_late() -> None:
     async with Plane(CELLS, at=(0.6, 1.5, 0.0)) as plane:
         await plane.go(0.2)
         await plane.ask_at_once(GOAL, GoalRequest(x=4.5, y=1.5))
@@ -76,12 +76,12 @@ async def fastest(plane: Plane, seconds: float) -> float:
 LARGE = np.pad(CELLS, ((0, 300), (0, 300)), constant_values=100)
 
 
-async def ticks_to_a_way(monkeypatch: pytest.MonkeyPatch, thinks_s: float) -> list[int]:
-    """The ticks in which a way came and in which another place was driven to."""
+async def ticks_of_routes(monkeypatch: pytest.MonkeyPatch, planning_s: float) -> list[int]:
+    """Return the ticks of the first route and of the route to another goal."""
     plan = RoutePlanner.plan
 
     def slowly(planner: RoutePlanner, request: RouteRequest) -> Route:
-        time.sleep(thinks_s)
+        time.sleep(planning_s)
         return plan(planner, request)
 
     monkeypatch.setattr(RoutePlanner, "plan", slowly)
@@ -98,11 +98,11 @@ async def ticks_to_a_way(monkeypatch: pytest.MonkeyPatch, thinks_s: float) -> li
     return ticks
 
 
-async def test_in_a_large_map_a_way_counts_from_the_same_scan_however_long_it_takes(
+async def test_in_a_large_map_a_route_applies_from_the_same_scan_however_long_it_takes(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    quick = await ticks_to_a_way(monkeypatch, 0.0)
-    assert await ticks_to_a_way(monkeypatch, 0.1) == quick
+    quick = await ticks_of_routes(monkeypatch, 0.0)
+    assert await ticks_of_routes(monkeypatch, 0.1) == quick
     assert quick[0] - 10 == 15
 
 
@@ -122,7 +122,7 @@ async def test_a_plan_for_a_huge_map_does_not_delay_the_first_one_for_the_real_m
         assert plane.tick - began <= 25
 
 
-async def test_it_plans_with_the_place_and_the_speed_of_the_scan_however_late_that_is() -> None:
+async def test_it_plans_with_the_pose_and_speed_of_a_late_scan() -> None:
     net = Net()
     source = ContextSource(net.one, ZoneSource(net.one))
     states = [state(tick, v=0.01 * tick, pose=(0.1 * tick, 0.0, 0.0)) for tick in range(1, 8)]

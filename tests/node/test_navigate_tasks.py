@@ -1,4 +1,4 @@
-"""Tasks, and the node that carries them out: pauses, exploring, roaming, restarts."""
+"""Tasks and the decision node that executes them: pauses, exploring, roaming, restarts."""
 
 import asyncio
 import math
@@ -16,7 +16,7 @@ EXPLORES = {"start": "explore"}
 STANDS = Velocity()
 
 
-async def test_a_driver_that_starts_anew_does_not_end_what_there_is_to_do() -> None:
+async def test_a_restart_of_the_driver_does_not_end_a_task() -> None:
     async with Plane(CELLS) as plane:
         await plane.go(0.2)
         await plane.ask_at_once(GOAL, GoalRequest(x=4.0, y=0.8))
@@ -26,7 +26,7 @@ async def test_a_driver_that_starts_anew_does_not_end_what_there_is_to_do() -> N
         assert plane.intent.reason.startswith("going to (4.00, 0.80): ")
 
 
-async def test_a_pause_stands_and_a_goal_before_it_goes_first() -> None:
+async def test_a_paused_task_stands_and_a_goal_before_it_goes_first() -> None:
     async with Plane(CELLS) as plane:
         await plane.go(0.2)
         await plane.ask(GOAL, GoalRequest(x=4.0, y=0.8))
@@ -41,7 +41,7 @@ async def test_a_pause_stands_and_a_goal_before_it_goes_first() -> None:
         assert [task.id for task in plane.status.queue] == ["goal-1"]
 
 
-async def test_exploring_ends_once_all_is_seen_that_can_be_reached() -> None:
+async def test_exploring_ends_once_all_reachable_space_is_known() -> None:
     plane = Plane(CELLS, at=(2.0, 1.0, 0.3))
     plane.known[:] = -1
     async with plane:
@@ -55,7 +55,7 @@ async def test_exploring_ends_once_all_is_seen_that_can_be_reached() -> None:
         assert plane.travelled > 0.5
 
 
-async def test_what_it_was_to_do_goes_on_after_a_restart_of_decision(tmp_path: Path) -> None:
+async def test_a_task_continues_after_a_restart_of_decision(tmp_path: Path) -> None:
     config = DecisionConfig(behaviour="navigate", state_dir=str(tmp_path))
     async with Plane(CELLS, config=config) as plane:
         await plane.go(0.2)
@@ -69,7 +69,7 @@ async def test_what_it_was_to_do_goes_on_after_a_restart_of_decision(tmp_path: P
         assert math.hypot(plane.x - 4.0, plane.y - 0.8) < 0.15
 
 
-async def test_who_roams_explores_and_then_visits_places_until_it_is_sent_elsewhere() -> None:
+async def test_a_roaming_robot_explores_and_then_visits_places_until_it_gets_a_goal() -> None:
     plane = Plane(
         CELLS,
         at=(2.0, 1.0, 0.3),
@@ -93,7 +93,7 @@ async def test_who_roams_explores_and_then_visits_places_until_it_is_sent_elsewh
         assert plane.status.done[0].reason == "replaced by goal-2"
 
 
-async def test_who_was_told_to_do_nothing_does_not_roam_after_a_restart_of_decision(
+async def test_a_robot_whose_tasks_were_cancelled_does_not_roam_after_a_restart(
     tmp_path: Path,
 ) -> None:
     config = DecisionConfig(behaviour="navigate", settings=EXPLORES, state_dir=str(tmp_path))
@@ -115,7 +115,7 @@ async def test_who_was_told_to_do_nothing_does_not_roam_after_a_restart_of_decis
         assert plane.status.current.label == "roaming"
 
 
-async def test_decision_says_what_the_task_list_says_while_a_mission_waits() -> None:
+async def test_intent_and_task_status_give_the_same_reason_while_a_mission_waits() -> None:
     mission = "do: [{wait: 5}, {goto: [2, 1]}]"
     async with Plane(CELLS) as plane:
         await plane.go(0.2)

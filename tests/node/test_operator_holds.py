@@ -1,4 +1,4 @@
-"""A goal while an operator holds the body: its clock stands, and its reason is the true one."""
+"""A goal while an operator holds the body: its timer stops, and its reason says why."""
 
 import math
 from collections.abc import Callable
@@ -20,7 +20,7 @@ CELLS = drawn(ROOM)
 
 
 class Held(Plane):
-    """A body that an operator, or the gate, may hold still."""
+    """A body that an operator or the gate can hold."""
 
     held = False
 
@@ -56,7 +56,7 @@ def script(plane: Held) -> None:
         (script, "script-7 has the body"),
     ],
 )
-async def test_a_goal_waits_for_whoever_holds_the_body_and_says_who_that_is(
+async def test_a_goal_waits_while_the_body_is_held_and_gives_the_reason(
     hold: Callable[[Held], None], why: str
 ) -> None:
     async with Held(CELLS) as plane:

@@ -1,4 +1,4 @@
-"""An arm presses buttons in MuJoCo, and hands over what it holds."""
+"""An arm presses buttons in MuJoCo, and hands over a held thing."""
 
 import math
 from pathlib import Path
@@ -19,8 +19,8 @@ PANEL = """<mujoco><worldbody>
       limited="true" stiffness="170" springref=".006" damping="2"/>
       <geom type="cylinder" size=".014 .004" pos="0 0 -.004" mass=".02"/></body></body>
   <body name="thing" pos="0 -1 .1"/></worldbody></mujoco>"""
-UP = {"at": "0.25 0 0.05", "turn": "0"}  # on the table, looks up
-AHEAD = {"at": "0.30 0 0.15", "turn": "-90"}  # on a wall, looks at the arm
+UP = {"at": "0.25 0 0.05", "turn": "0"}  # on the table, faces up
+AHEAD = {"at": "0.30 0 0.15", "turn": "-90"}  # on a wall, faces the arm
 
 
 def before_a_panel(folder: Path, body: str, **where: str) -> Rig:
@@ -31,7 +31,7 @@ def before_a_panel(folder: Path, body: str, **where: str) -> Rig:
 
 
 def pressed(rig: Rig, text: str) -> tuple[str, str, float]:
-    """Return how a mission ended, why, and how far the button was in at most [m]."""
+    """Return the final state and reason of a mission, and the maximum travel of the button [m]."""
     rig.give(text)
     data = rig.arm.simulation.data
     deepest = 0.0
@@ -39,7 +39,7 @@ def pressed(rig: Rig, text: str) -> tuple[str, str, float]:
         rig.tick()
         deepest = min(deepest, float(data.joint("world/button").qpos[0]))
     done = rig.queue.status.done[0]
-    assert abs(data.joint("world/button").qpos[0]) < 0.001  # it was let go of
+    assert abs(data.joint("world/button").qpos[0]) < 0.001  # it is released
     return done.state, done.reason, -deepest
 
 
@@ -52,7 +52,7 @@ def pressed(rig: Rig, text: str) -> tuple[str, str, float]:
         ("piper", UP, "press: [0.25, 0, 0.05]"),
     ],
 )
-def test_a_button_is_pressed_and_let_go_of(
+def test_a_button_is_pressed_and_released(
     tmp_path: Path, body: str, where: dict[str, str], step: str
 ) -> None:
     rig = before_a_panel(tmp_path, body, **where)
@@ -65,7 +65,7 @@ def test_a_button_is_pressed_and_let_go_of(
     assert rig.arm.broken == 0
 
 
-def test_where_there_is_nothing_to_press_it_says_so_and_goes_back(tmp_path: Path) -> None:
+def test_it_fails_and_backs_off_where_there_is_nothing_to_press(tmp_path: Path) -> None:
     rig = before_a_panel(tmp_path, "so101", **UP)
     state, reason, depth = pressed(rig, "do: [{press: {at: [0.2, 0.1, 0.12], depth: 0.02}}]")
     rig.manipulator.close()
@@ -77,7 +77,7 @@ def test_where_there_is_nothing_to_press_it_says_so_and_goes_back(tmp_path: Path
     assert math.dist(tool.position, (0.2, 0.1, 0.12)) == pytest.approx(0.04, abs=0.01)
 
 
-def test_what_cannot_be_reached_is_not_pressed(tmp_path: Path) -> None:
+def test_a_button_out_of_reach_is_not_pressed(tmp_path: Path) -> None:
     rig = before_a_panel(tmp_path, "so101", **UP)
     before = rig.arm.posture(rig.arm.arm.names)
     state, reason, _ = pressed(rig, "do: [{press: [0.8, 0, 0.1]}]")
@@ -87,7 +87,7 @@ def test_what_cannot_be_reached_is_not_pressed(tmp_path: Path) -> None:
     assert rig.arm.posture(rig.arm.arm.names) == pytest.approx(before, abs=1e-3)
 
 
-def test_an_interrupted_press_begins_again(tmp_path: Path) -> None:
+def test_an_interrupted_press_starts_again(tmp_path: Path) -> None:
     rig = before_a_panel(tmp_path, "so101", **UP)
     rig.give("do: [{press: [0.25, 0, 0.05]}]")
     while rig.outcome is None or rig.outcome.reason != "press":
@@ -118,21 +118,21 @@ def offering(tmp_path: Path) -> Any:
 
 
 def let_go(rig: Rig) -> bool:
-    """Return whether nothing is between the fingers, and the arm is at home."""
+    """Return whether the gripper is empty, and the arm is at home."""
     assert rig.arm.description.arm
     home = rig.arm.description.arm.home[:5]
     measured = [rig.arm.measured(name) for name in rig.planner.arm.names]
     return rig.manipulator._grip.hold is None and measured == pytest.approx(home, abs=0.05)
 
 
-def test_what_is_pulled_at_is_let_go_of(offering: Rig) -> None:
+def test_the_gripper_lets_go_of_a_thing_that_is_pulled(offering: Rig) -> None:
     place = offering.arm.thing()
     assert place[0] > 0.15
     assert place[2] > 0.12
     for _ in range(100):
         offering.tick()
     assert offering.outcome
-    assert offering.outcome.activity == "offering"  # its own weight is no pull
+    assert offering.outcome.activity == "offering"  # the weight of the cube is no pull
     body = offering.arm.simulation.model.body("world/thing").id
     offering.arm.simulation.data.xfrc_applied[body, :3] = 3.0, 0.0, 1.5
     task = offering.carry_on()
@@ -140,7 +140,7 @@ def test_what_is_pulled_at_is_let_go_of(offering: Rig) -> None:
     assert let_go(offering)
 
 
-def test_what_is_taken_out_of_the_fingers_is_handed_over(offering: Rig) -> None:
+def test_a_thing_taken_out_of_the_fingers_is_handed_over(offering: Rig) -> None:
     for _ in range(30):
         offering.tick()
     offering.take_away()
@@ -148,7 +148,7 @@ def test_what_is_taken_out_of_the_fingers_is_handed_over(offering: Rig) -> None:
     assert let_go(offering)
 
 
-def test_at_a_word_it_lets_go(offering: Rig) -> None:
+def test_the_gripper_lets_go_after_a_confirmation(offering: Rig) -> None:
     assert offering.queue.resume("") == "mission-1 lets go of it"
     assert offering.carry_on().state == "succeeded"
     assert let_go(offering)
@@ -156,7 +156,7 @@ def test_at_a_word_it_lets_go(offering: Rig) -> None:
         offering.queue.resume("")
 
 
-def test_what_nobody_takes_is_kept(offering: Rig) -> None:
+def test_a_thing_that_nobody_takes_stays_in_the_gripper(offering: Rig) -> None:
     task = offering.carry_on()
     assert task.state == "failed"
     assert task.reason == "nobody took cube within 8 s; the gripper holds it still"

@@ -1,4 +1,4 @@
-"""Decision's own node looks for things, and drives before them and before tags."""
+"""The decision node searches for objects and tags, and drives to them."""
 
 import math
 from typing import Any
@@ -35,7 +35,7 @@ SIGHT_M, HALF_VIEW = 2.5, 0.45
 
 
 class Seeing(Plane):
-    """A body with a camera; what is in its view is recognised, as perception would."""
+    """A body with a camera that recognises the objects in its view, like perception."""
 
     def __init__(self, *things: MapObject, tags: tuple[MapTag, ...] = (), **more: Any) -> None:
         super().__init__(FLAT, **more)
@@ -81,7 +81,7 @@ def thing(number: int, x: float, y: float, label: str = "can") -> MapObject:
     return MapObject(id=number, label=label, x=x, y=y, z=0.06, size=(0.07, 0.12), confidence=0.9)
 
 
-async def test_it_drives_before_a_can_that_it_knows_and_faces_it() -> None:
+async def test_it_drives_to_a_known_can_and_faces_it() -> None:
     async with Seeing(thing(3, 2.8, 1.2)) as plane:
         await plane.go(2.0)
         reply = await plane.ask(GOAL, GoalRequest(object="can"))
@@ -103,7 +103,7 @@ async def test_it_looks_for_a_can_in_the_next_room() -> None:
 
 
 @pytest.mark.slow
-async def test_where_there_is_none_it_says_so_after_it_has_looked_everywhere() -> None:
+async def test_a_search_without_a_can_fails_after_looking_everywhere() -> None:
     async with Seeing(thing(3, 2.8, 1.2, "ball")) as plane:
         await plane.go(0.5)
         request = MissionRequest(mission="do: [{find: can}]")
@@ -114,7 +114,7 @@ async def test_where_there_is_none_it_says_so_after_it_has_looked_everywhere() -
         assert plane.travelled > 3.0
 
 
-async def test_before_a_tag_it_faces_it() -> None:
+async def test_it_faces_a_tag() -> None:
     tag = MapTag(id=7, x=7.7, y=2.0, z=0.4, yaw=math.pi, size=0.16)
     async with Seeing(tags=(tag,)) as plane:
         await plane.go(2.0)
@@ -125,7 +125,7 @@ async def test_before_a_tag_it_faces_it() -> None:
         assert plane.off(7.7, 2.0)[1] < 0.25
 
 
-async def test_a_can_that_is_carried_away_under_way_is_looked_for_elsewhere() -> None:
+async def test_a_can_carried_away_meanwhile_is_sought_elsewhere() -> None:
     async with Seeing(thing(3, 2.8, 1.2)) as plane:
         await plane.go(2.0)
         await plane.ask(GOAL, GoalRequest(object="can"))
@@ -135,7 +135,7 @@ async def test_a_can_that_is_carried_away_under_way_is_looked_for_elsewhere() ->
         assert plane.status.done[0].reason.endswith("before can 4")
 
 
-async def test_while_nothing_is_recognised_it_stands_and_says_why() -> None:
+async def test_it_stands_with_a_reason_while_recognition_does_not_run() -> None:
     async with Seeing(thing(3, 2.8, 1.2)) as plane:
         plane.recognizing = False
         plane.things = []
@@ -146,7 +146,7 @@ async def test_while_nothing_is_recognised_it_stands_and_says_why() -> None:
         assert "recognition" in plane.status.doing
 
 
-async def test_without_cameras_things_are_refused_in_one_line() -> None:
+async def test_a_search_without_cameras_is_refused_in_one_line() -> None:
     async with Plane(FLAT) as plane:
         await plane.go(0.5)
         for request in (GoalRequest(object="can"), GoalRequest(tag=7)):
@@ -158,7 +158,7 @@ async def test_without_cameras_things_are_refused_in_one_line() -> None:
         assert OBJECT_MAP.key not in plane.bench.bus.listens
 
 
-async def test_with_a_camera_on_its_arm_alone_it_cannot_look_for_things() -> None:
+async def test_a_search_with_only_a_camera_on_the_arm_is_refused() -> None:
     async with Seeing() as plane:
         plane.description = replace(ARMED, cameras=(WRIST,))
         await plane.go(0.5)
@@ -167,7 +167,7 @@ async def test_with_a_camera_on_its_arm_alone_it_cannot_look_for_things() -> Non
         assert reply.text.startswith("the robot has no camera but on its arm; ")
 
 
-async def test_a_name_that_only_an_object_has_is_refused_with_the_command_for_it() -> None:
+async def test_the_name_of_an_object_as_place_is_refused_with_the_right_command() -> None:
     async with Seeing(thing(3, 2.8, 1.2)) as plane:
         await plane.go(2.0)
         reply = await plane.ask(GOAL, GoalRequest(place="can"))

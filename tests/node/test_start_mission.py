@@ -1,4 +1,4 @@
-"""The mission that a robot begins with by itself: places of the map, and what it refuses."""
+"""The start mission of a robot: places of the map, and refusals."""
 
 import math
 from pathlib import Path
@@ -60,7 +60,7 @@ async def test_a_task_ends_the_wait_for_places(tmp_path: Path) -> None:
         ("posture: home", "waffle has no arm"),
     ],
 )
-async def test_what_it_cannot_do_is_refused_in_one_line(
+async def test_an_impossible_start_mission_is_refused_in_one_line(
     tmp_path: Path, caplog: pytest.LogCaptureFixture, step: str, why: str
 ) -> None:
     async with begins_with(tmp_path, f"do:\n- {step}") as plane:
