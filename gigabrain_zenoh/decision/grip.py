@@ -62,7 +62,7 @@ class Grip:
         self._set_place(hold.grip)
 
     def close_at(self, planner: ArmPlanner, state: RobotState, place: float) -> None:
-        """Record that a command moved the gripper; it holds whatever stopped it before `place`."""
+        """Record that a command moved the gripper; it holds what stopped it before `place`."""
         self.release()
         if planner.holds(gripper_place(planner, state, place), place):
             self._set_place(place)
