@@ -284,7 +284,11 @@ def _not_finite(state: GateState, event: NotFinite) -> tuple[GateState, Outcome]
     recent = (*(t for t in before if state.tick - t < NAN_STORM_TICKS), state.tick)
     cause = why.NAN_STORM if len(recent) >= NAN_STORM_COUNT else why.NOT_FINITE
     causes = why.merge(state.causes, (cause,))
-    state = _stop(state, causes) if state.mode == "enabled" else replace(state, causes=causes)
+    if state.mode == "enabled":
+        state = _stop(state, causes)
+    else:  # while idle it latches at once: an enable would forget the causes
+        latches = state.mode == "idle" and why.latching(causes)
+        state = replace(state, causes=causes, mode="latched" if latches else state.mode)
     state = replace(state, nan_ticks=recent, nan_source=event.source)
     return replace(state, healthy_ticks=0, before=ZERO), refused
 

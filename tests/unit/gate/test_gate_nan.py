@@ -111,6 +111,21 @@ def test_once_the_gate_is_idle_only_that_of_whoever_lost_the_body_by_it_counts()
     assert rig.codes == ["nan"]
 
 
+def test_the_fifth_from_a_former_commander_latches_before_an_enable_forgets_it() -> None:
+    rig = enabled()
+    rig.live(5)
+    for _ in range(4):
+        rig.feed(gate.NotFinite("control", BOOT))
+    rig.until("idle", lambda: rig.live(1))
+    latches = rig.state.latches
+    rig.feed(gate.NotFinite("control", BOOT))
+    assert (rig.mode, rig.codes) == ("latched", ["nan_storm"])
+    assert rig.state.latches == latches + 1
+    assert not rig.feed(gate.Enable("control", take=True)).ok
+    rig.live(1)
+    assert (rig.mode, rig.codes) == ("latched", ["nan_storm"])
+
+
 @pytest.mark.parametrize(("ticks", "codes"), [(49, ["nan", "nan_storm"]), (50, ["nan"])])
 def test_five_in_more_than_a_second_do_not(ticks: int, codes: list[str]) -> None:
     rig = driving(0.2)

@@ -74,6 +74,7 @@ class GateMachine(RuleBasedStateMachine):
         self.newest_command: CmdVel | None = None  # its newest good command
         self.newest_command_tick = 0
         self.seq = 0
+        self.nan_source = ""  # the newest commander that sent a value that is not finite
         self.newest_safety: SafetyState | None = None
         self.faults: tuple[Cause, ...] = ()
         self.still = 0
@@ -155,7 +156,9 @@ class GateMachine(RuleBasedStateMachine):
         for _ in range(times):
             before = self.state
             assert self.feed(gate.NotFinite(source, boot)).refused == "not_finite"
-            assert (self.state != before) == (boot == BOOT and source == before.commander != "")
+            counts = source == (before.commander or self.nan_source) != ""
+            counts &= boot == BOOT and before.mode != "latched"
+            assert (self.state != before) == counts
 
     @rule(source=sources)
     def estop(self, source: str) -> None:
@@ -233,6 +236,10 @@ class GateMachine(RuleBasedStateMachine):
             self.enabled_tick, self.newest_command = self.state.tick, None
         if isinstance(event, gate.VelocityCommand) and not outcome.refused:
             self.newest_command, self.newest_command_tick = event.command, self.state.tick
+        if outcome.refused == "not_finite" and self.state != before:
+            of = event.command if isinstance(event, gate.VelocityCommand) else event
+            assert isinstance(of, gate.NotFinite | CmdVel)
+            self.nan_source = of.source
         theirs = before.commander != "" and outcome.refused == "not_finite"
         if isinstance(event, gate.Estop) or (theirs and self.state != before):
             self.sent = (0.0, 0.0, 0.0)  # these two cut the output at once
