@@ -123,7 +123,7 @@ def test_the_brain_knows_its_base_by_the_text_alone() -> None:
     postures = np.array([robot.arm.home, ONTO_ITS_PLATE])
     within = np.full((2, len(shape.levers)), robot.thresholds.arm_clearance)
     near = shape.near(postures, within)
-    assert set(near.where.tolist()) == {1}
+    assert set(near.postures.tolist()) == {1}
     assert {shape.describe(pair)[:2] for pair in near.pairs.tolist()} == {("self", "base")}
 
 
