@@ -37,7 +37,7 @@ from gigabrain_zenoh.errors import BodyLost, Refused
 from gigabrain_zenoh.gateway.conversions.sensors import laser_scan
 from gigabrain_zenoh.host.bounded import percentile
 from gigabrain_zenoh.launch.deployment import Deployment
-from gigabrain_zenoh.qa.bench.goals import START_S, GoalSender
+from gigabrain_zenoh.qa.bench.goals import START_TIMEOUT_S, GoalSender
 from gigabrain_zenoh.qa.robot_under_test import LOOPBACK, ProcessGroup, measured_robot
 from gigabrain_zenoh.ros2.dds import DdsTransport
 from gigabrain_zenoh.ros2.qos import SENSOR_DATA
@@ -116,7 +116,7 @@ async def running(judge: Judge, world: str, **parts: Any) -> AsyncIterator[Robot
     ros2 = Ros2Config(transport="dds", domain=judge.domain, localhost=True)
     body = "turtlebot3_burger"
     deployment = Deployment(body=body, world=world, router=LOOPBACK, ros2=ros2, **parts)
-    async with measured_robot(deployment, ready_s=START_S) as (group, bus):
+    async with measured_robot(deployment, ready_s=START_TIMEOUT_S) as (group, bus):
         robot = Robot(group, bus)
         await until(lambda: robot.states, "states")
         yield robot
@@ -286,7 +286,7 @@ async def goals(judge: Judge, count: int) -> dict[str, tuple[int, int]]:
     brain["decision"] = DecisionConfig(behaviour="navigate")
     async with running(judge, "house", **brain) as robot:
         sender = GoalSender(robot.bus, robot.group, seed=0)
-        await until(lambda: sender.is_localized, "a map", START_S)
+        await until(lambda: sender.is_localized, "a map", START_TIMEOUT_S)
         say("exploring the house")
         await sender.explore()
         client = judge.start("navigate")
