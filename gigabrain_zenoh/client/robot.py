@@ -251,8 +251,10 @@ class Robot(Commander):
         and raises ConfigError where a joint would have to move faster than it can.
         """
         body = await self.read_body()
-        for _, positions in points:
-            checked_positions(body, positions)
+        check_joints(body)
+        source = self._bus.process
+        stream = self._joints or JointStream(body, await self.read_state(), source)
+        JointPath(body, points, stream.posture)  # a refused one does not take the body
         stream = await self._joint_stream(body)
         stream.follow(JointPath(body, points, stream.posture))
         return await self._wait_for_joints(body, stream, wait)

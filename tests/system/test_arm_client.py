@@ -87,6 +87,7 @@ async def test_what_a_joint_cannot_do_is_refused_and_nothing_moves(arm: Probe) -
             await script.set_joint_position("gripper", 0.1, speed=0.0)
         with pytest.raises(Unsupported, match="so101 has no base to drive"):
             await script.set_base_velocity(0.1)
+        await arm.ticks(3)
         assert arm.state.gate.commander == "control"
         assert posture(arm) == pytest.approx(before, abs=0.01)
 
