@@ -45,7 +45,7 @@ class Grip:
 
     @property
     def held(self) -> Held | None:
-        """What the gripper holds, or held before a restart, in the format of the task file."""
+        """Describe the held thing, also one from before a restart, in the task file's format."""
         if self._recalled is not None:
             return self._recalled
         hold = self.hold
@@ -53,7 +53,7 @@ class Grip:
 
     @property
     def text(self) -> str:
-        """What the gripper holds, as text for users; empty for nothing."""
+        """Describe the held thing for users; empty for none."""
         return f"it holds {self._thing.name}" if self._thing else ""
 
     def take(self, hold: Hold) -> None:

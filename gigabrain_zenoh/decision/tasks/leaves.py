@@ -49,7 +49,7 @@ def seek_nothing(_wanted: Wanted, _without: Collection[int], _preferred: int | N
 
 @dataclass
 class Hand:
-    """What the gripper is believed to hold; shared by all tasks."""
+    """The thing in the gripper, as far as decision knows; shared by all tasks."""
 
     held: Held | None = None
 

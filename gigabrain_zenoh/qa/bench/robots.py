@@ -81,7 +81,7 @@ class RobotsResult(Struct, frozen=True, kw_only=True):
 
     @property
     def verdict(self) -> str:
-        """Whether the machine is large enough for them, as one line."""
+        """State in one line if the machine is large enough for the robots."""
         count = len(self.robots)
         slow = [f"robot {one.number}: {one.too_slow}" for one in self.robots if one.too_slow]
         failed = [f"robot {one.number}: {one.problem}" for one in self.robots if one.problem]

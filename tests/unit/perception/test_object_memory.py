@@ -121,7 +121,7 @@ def test_an_object_that_was_taken_away_is_forgotten_when_its_place_is_seen() -> 
     [
         ((0.0, 0.0, math.pi), NOTHING),  # behind the robot
         ((-3.0, 0.0, 0.0), NOTHING),  # far away
-        ((0.0, 0.0, 0.0), np.array(((1.0, 0.15), (1.0, 0.16)))),  # somebody stands in front of it
+        ((0.0, 0.0, 0.0), np.array(((1.0, 0.15), (1.0, 0.16)))),  # a person stands in front of it
         ((1.85, 0.3, 0.0), NOTHING),  # below the picture
     ],
 )
