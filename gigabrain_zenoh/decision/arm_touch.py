@@ -5,12 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gigabrain_schemas.body import BodyDescription, RobotState
-from gigabrain_zenoh.decision.arm_readings import (
-    measured_efforts,
-    measured_posture,
-    sent_posture,
-)
+from gigabrain_zenoh.decision.arm_readings import ArmReading
 from gigabrain_zenoh.manipulation.arm_planner import ArmPlanner
 from gigabrain_zenoh.manipulation.contact import ContactSense, Push
 
@@ -43,21 +38,21 @@ class Touch:
     """Compares each state with the first ones, which have no contact."""
 
     def __init__(self, planner: ArmPlanner) -> None:
-        self._planner, self._sense = planner, ContactSense(planner.arm)
+        self._sense = ContactSense(planner.arm)
         self._pulled_ticks = 0
 
-    def pressure(self, body: BodyDescription, state: RobotState) -> Pressure | None:
+    def pressure(self, arm: ArmReading) -> Pressure | None:
         """Return how hard the tool presses; None during the first states."""
-        push = self._feel(body, state)
+        push = self._feel(arm)
         if push is None:
             return None
-        approach = self._planner.arm.forward(measured_posture(self._planner, state)).axes[:, 0]
+        approach = arm.planner.arm.forward(arm.measured_posture).axes[:, 0]
         force = None if push.force is None else -float(push.force @ approach)
         return Pressure(newtons=force, metres=float(push.lag @ approach))
 
-    def is_pulled(self, body: BodyDescription, state: RobotState) -> bool:
+    def is_pulled(self, arm: ArmReading) -> bool:
         """Return whether a person pulls, since PULLED_TICKS or longer."""
-        push = self._feel(body, state)
+        push = self._feel(arm)
         pulls = push is not None and (
             float(np.linalg.norm(push.lag)) > PULLED_M
             or (push.force is not None and float(np.linalg.norm(push.force)) > PULLED_N)
@@ -65,9 +60,5 @@ class Touch:
         self._pulled_ticks = self._pulled_ticks + 1 if pulls else 0
         return self._pulled_ticks >= PULLED_TICKS
 
-    def _feel(self, body: BodyDescription, state: RobotState) -> Push | None:
-        return self._sense.feel(
-            measured_posture(self._planner, state),
-            sent_posture(self._planner, body, state),
-            measured_efforts(self._planner, state),
-        )
+    def _feel(self, arm: ArmReading) -> Push | None:
+        return self._sense.feel(arm.measured_posture, arm.sent_posture, arm.measured_efforts)

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from gigabrain_schemas.base import TICK_S
-from gigabrain_schemas.body import BodyDescription, RobotState
+from gigabrain_schemas.body import BodyDescription
 from gigabrain_schemas.brain import Intent
-from gigabrain_zenoh.decision.arm_readings import gripper_place, posture_of, sent_posture
+from gigabrain_zenoh.decision.arm_readings import ArmReading, posture_of
 from gigabrain_zenoh.decision.behaviours import StepOutcome, StepResult
 from gigabrain_zenoh.decision.held_things import standing_height, thing_of
 from gigabrain_zenoh.decision.tasks.arm_steps import (
@@ -24,7 +24,7 @@ from gigabrain_zenoh.decision.tasks.arm_steps import (
     TakePosture,
     thing_meant,
 )
-from gigabrain_zenoh.manipulation.arm_planner import ArmPlanner, Hold, Plan
+from gigabrain_zenoh.manipulation.arm_planner import Hold, Plan
 from gigabrain_zenoh.manipulation.phases import PhaseRun
 from gigabrain_zenoh.manipulation.pick_place import NoWay
 
@@ -35,33 +35,33 @@ Planned = Plan | NoWay
 class WorkInputs:
     """Inputs for the plan of an action."""
 
-    state: RobotState
-    body: BodyDescription
+    arm: ArmReading
     things: Mapping[str, Solid]  # around the arm
     hold: Hold | None
     misses: int  # failed grasps of this command
     drives: bool  # the body can drive to a thing out of reach
 
 
-def work_for(planner: ArmPlanner, do: ArmAction, now: WorkInputs) -> Callable[[], Planned] | str:
+def work_for(do: ArmAction, now: WorkInputs) -> Callable[[], Planned] | str:
     """Return a function that plans an action, or why it cannot be planned."""
-    if len(now.state.joints_sent) != len(now.body.joints):
+    planner, body, hold = now.arm.planner, now.arm.body, now.hold
+    if len(now.arm.state.joints_sent) != len(body.joints):
         return "the joints are not measured, or limp"
     name = thing_meant(do)
-    if name is not None and now.hold:
-        return f"the gripper holds {now.hold.thing.name} already"
+    if name is not None and hold:
+        return f"the gripper holds {hold.thing.name} already"
     if name is not None and name not in now.things:
         return f"where {name} is, is not known"
-    posture, hold = sent_posture(planner, now.body, now.state), now.hold
+    posture = now.arm.sent_posture
     others = {other: thing_of(other, solid) for other, solid in now.things.items()}
     thing = others.pop(name) if name is not None else None
     around = [*others.values()]
-    gripper_at = gripper_place(planner, now.state, 0.0) if planner.arm.gripper else None
+    gripper_at = now.arm.gripper_place(0.0) if planner.arm.gripper else None
     match do:
         case Reach(at=at, pitch=pitch):
             return lambda: planner.reach(np.array(at), pitch, around, posture, hold, gripper_at)
         case TakePosture(to=to):
-            goal = posture_of(now.body, to) if isinstance(to, str) else to
+            goal = posture_of(body, to) if isinstance(to, str) else to
             return lambda: planner.take_posture(goal, around, posture, hold, gripper_at)
         case Gripper(to=to):
             return lambda: planner.grip(to)
@@ -77,7 +77,7 @@ def work_for(planner: ArmPlanner, do: ArmAction, now: WorkInputs) -> Callable[[]
             return "the gripper holds nothing"
         case PlaceThing(at=at):
             assert hold
-            target = np.array(at if len(at) == 3 else (*at, standing_height(hold, now.body)))
+            target = np.array(at if len(at) == 3 else (*at, standing_height(hold, body)))
             return lambda: planner.place(hold, target, around, posture)
         case HandOver(at=at, pitch=pitch):
             assert hold

@@ -1,16 +1,10 @@
 """Records what the gripper holds, and controls its grip while the arm or the body moves."""
 
-from gigabrain_schemas.body import BodyDescription, RobotState
 from gigabrain_schemas.brain import JointTarget
-from gigabrain_zenoh.decision.arm_readings import (
-    gripper_place,
-    sent_place,
-    squeezes,
-    still_held,
-)
+from gigabrain_zenoh.decision.arm_readings import ArmReading
 from gigabrain_zenoh.decision.held_things import held_thing, hold_of
 from gigabrain_zenoh.decision.tasks.arm_steps import Held, HeldThing
-from gigabrain_zenoh.manipulation.arm_planner import ArmPlanner, Hold
+from gigabrain_zenoh.manipulation.arm_planner import Hold
 from gigabrain_zenoh.manipulation.collision import Thing
 from gigabrain_zenoh.manipulation.phases import Phase, PhaseRun
 
@@ -61,10 +55,10 @@ class Grip:
         self._thing, self._opening = hold.thing, hold.opening
         self._set_place(hold.grip)
 
-    def close_at(self, planner: ArmPlanner, state: RobotState, place: float) -> None:
+    def close_at(self, arm: ArmReading, place: float) -> None:
         """Record that a command moved the gripper; it holds what stopped it before `place`."""
         self.release()
-        if planner.holds(gripper_place(planner, state, place), place):
+        if arm.planner.holds(arm.gripper_place(place), place):
             self._set_place(place)
 
     def release(self) -> None:
@@ -72,52 +66,49 @@ class Grip:
         self._thing = None
         self._set_place(None)
 
-    def recall(self, planner: ArmPlanner, body: BodyDescription, state: RobotState) -> None:
+    def recall(self, arm: ArmReading) -> None:
         """Restore what the gripper held before a restart, if the measured state agrees; once."""
         recalled, self._recalled = self._recalled, None
-        if recalled is None or planner.arm.gripper is None:
+        if recalled is None or arm.planner.arm.gripper is None:
             return
         if isinstance(recalled, HeldThing):
-            if hold := still_held(planner, body, state, hold_of(recalled)):
+            if hold := arm.still_held(hold_of(recalled)):
                 self.take(hold)
-        elif squeezes(planner, body, state, recalled):
+        elif arm.squeezes(recalled):
             self._set_place(recalled)
         if self._place is not None:
-            self._set_place(sent_place(planner, body, state, self._place))
+            self._set_place(arm.sent_place(self._place))
 
-    def keeps(self, planner: ArmPlanner, body: BodyDescription, state: RobotState) -> bool:
+    def keeps(self, arm: ArmReading) -> bool:
         """Return whether the thing is still held, also after a small change of the command."""
         hold = self.hold
-        if hold and (hold := still_held(planner, body, state, hold)):
+        if hold and (hold := arm.still_held(hold)):
             self._set_place(hold.grip)
         return hold is not None
 
-    def make_firm(self, planner: ArmPlanner, run: PhaseRun, state: RobotState) -> None:
+    def make_firm(self, arm: ArmReading, run: PhaseRun) -> None:
         """Insert a phase into `run` that squeezes the thing firmly enough for a moving arm."""
-        self.firm_tick = state.tick
+        self.firm_tick = arm.state.tick
         assert self._place is not None
-        measured = gripper_place(planner, state, self._place)
-        place = planner.squeeze(measured, self._place, moving=True)
+        place = arm.planner.squeeze(arm.gripper_place(self._place), self._place, moving=True)
         if place != self._place:
             run.insert(Phase(name="squeeze", gripper=place))
             self._set_place(place)
 
-    def follow(
-        self, planner: ArmPlanner, body: BodyDescription, state: RobotState
-    ) -> tuple[JointTarget, ...]:
+    def follow(self, arm: ArmReading) -> tuple[JointTarget, ...]:
         """Return the target that adjusts the grip of a resting arm; nothing if it is good."""
-        gripper, place = planner.arm.gripper, self._place
+        gripper, place, tick = arm.planner.arm.gripper, self._place, arm.state.tick
         if gripper is None or place is None:
             return ()
-        elapsed, sent = state.tick - self._since_tick, sent_place(planner, body, state, place)
+        elapsed, sent = tick - self._since_tick, arm.sent_place(place)
         sent_there = abs(sent - place) <= AT_PLACE * (gripper.upper - gripper.lower)
         if self.moves and (sent_there or not 0 <= elapsed < MAX_MOVE_TICKS):
-            place, self.moves, self._since_tick = sent, False, state.tick
+            place, self.moves, self._since_tick = sent, False, tick
         elif sent_there and not self.moves and not 0 <= elapsed < REST_TICKS:
-            measured = gripper_place(planner, state, place)
-            if planner.holds(measured, place):
-                place = planner.squeeze(measured, place, moving=False)
-                self.moves, self._since_tick = place != self._place, state.tick
+            measured = arm.gripper_place(place)
+            if arm.planner.holds(measured, place):
+                place = arm.planner.squeeze(measured, place, moving=False)
+                self.moves, self._since_tick = place != self._place, tick
         self._place = place
         return (JointTarget(name=gripper.name, position=place),) if self.moves else ()
 

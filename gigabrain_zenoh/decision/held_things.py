@@ -6,8 +6,9 @@ import numpy as np
 
 from gigabrain_schemas.arrays import Floats
 from gigabrain_schemas.body import BodyDescription
+from gigabrain_zenoh.decision.arm_readings import ArmReading
 from gigabrain_zenoh.decision.tasks.arm_steps import ArmAction, HeldThing, PlaceThing, Solid
-from gigabrain_zenoh.manipulation.arm_planner import ArmPlanner, Hold
+from gigabrain_zenoh.manipulation.arm_planner import Hold
 from gigabrain_zenoh.manipulation.collision import Thing, turned
 
 
@@ -36,14 +37,12 @@ def solid_of(thing: Thing, at: Floats, yaw: float) -> Solid:
     )
 
 
-def placed(
-    planner: ArmPlanner, measured: Floats, action: ArmAction, hold: Hold, body: BodyDescription
-) -> tuple[str, Solid]:
-    """Return the name and solid of a thing that an arm at `measured` (n,) just let go of."""
-    tool, thing = planner.arm.forward(measured), hold.thing
+def placed(arm: ArmReading, action: ArmAction, hold: Hold) -> tuple[str, Solid]:
+    """Return the name and solid of a thing that an arm just let go of."""
+    tool, thing = arm.planner.arm.forward(arm.measured_posture), hold.thing
     at, ahead = tool.place(thing.position), tool.axes @ thing.axes[:, 0]
     if isinstance(action, PlaceThing):  # it now stands on something, or on the floor
-        at[2] = action.at[2] if len(action.at) == 3 else standing_height(hold, body)
+        at[2] = action.at[2] if len(action.at) == 3 else standing_height(hold, arm.body)
     return thing.name, solid_of(thing, at, math.atan2(ahead[1], ahead[0]))
 
 

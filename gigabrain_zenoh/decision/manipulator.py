@@ -13,16 +13,11 @@ from gigabrain_schemas.objects import SeenSolid
 from gigabrain_schemas.topics import ARM_MODEL
 from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.decision.arm_readings import (
+    ArmReading,
     begins_at,
-    gripper_moves,
-    holds,
-    is_at,
-    measured_posture,
     off_from,
     pace,
     rest_of_place,
-    sent_posture,
-    sent_to,
 )
 from gigabrain_zenoh.decision.arm_touch import Touch
 from gigabrain_zenoh.decision.arm_work import (
@@ -131,7 +126,8 @@ class Manipulator:
         """
         intent, outcome = self._step(state, body, command, idle, held, seen)
         if self._planner and not self._run and not held:
-            intent = replace(intent, joints=self._grip.follow(self._planner, body, state))
+            arm = ArmReading(self._planner, body, state)
+            intent = replace(intent, joints=self._grip.follow(arm))
         self._display.show(self._planner, self._plan if self._run else None)
         return intent, replace(outcome, holds=self._grip.held, placed=self._achieved.placed)
 
@@ -158,8 +154,9 @@ class Manipulator:
         if self._run:
             self._base_pose = state.pose
         measured = {joint.name for joint in body.joints} <= {joint.name for joint in state.joints}
-        if planner and measured and not held:
-            self._grip.recall(planner, body, state)
+        arm = ArmReading(planner, body, state) if planner else None
+        if arm and measured and not held:
+            self._grip.recall(arm)
         if command is None:
             self._interrupt()
             self._lookout.reset()
@@ -169,17 +166,17 @@ class Manipulator:
             if self._run:  # a plan in the making stays valid unless the arm is moved
                 self._interrupt()
             return self._still(Idle("waiting", f"waiting: {held}"), held=True)
-        if planner is None:
+        if arm is None:
             return self._still(NO_MODEL)
         if not measured:
             return self._still(NOT_MEASURED)
-        at_thing = self._abandoned and is_at(self._abandoned, self._base_pose, planner, body, state)
+        at_thing = self._abandoned and arm.is_at_thing(self._abandoned, self._base_pose)
         if self._run is None and self._abandoned and not at_thing:  # something else moved the arm
             self._abandoned = self._put_down = None
         if self._run is None and self._achieved.number and not self._abandoned:
             return self._still(Idle("done", self._achieved.reason), self._achieved)
         try:
-            return self._carry_out(planner, state, body, command, seen)
+            return self._carry_out(arm, command, seen)
         except GigabrainError as error:  # the thing does not fit, or the arm has no pads
             return self._fail(str(error))
 
@@ -210,32 +207,27 @@ class Manipulator:
         return self._planner
 
     def _carry_out(
-        self,
-        planner: ArmPlanner,
-        state: RobotState,
-        body: BodyDescription,
-        command: ArmCommand,
-        seen: tuple[SeenSolid, ...],
+        self, arm: ArmReading, command: ArmCommand, seen: tuple[SeenSolid, ...]
     ) -> StepResult:
         still = not (self._run or self._planning or self._grip.moves)
-        if still and self._grip.hold and not self._grip.keeps(planner, body, state):
-            self._let_go(state) if self._put_down else self._grip.release()
+        if still and self._grip.hold and not self._grip.keeps(arm):
+            self._let_go(arm) if self._put_down else self._grip.release()
         do, hold = command.do, self._grip.hold
         if isinstance(do, Pick) and self._run is None and hold and hold.thing.name == do.thing:
             self._achieved = self._success(self._grip.text)
             return self._still(Idle("done", self._achieved.reason), self._achieved)
-        if hold and still_stands(seen, self._camera_id, state.tick - self._grip.firm_tick):
+        if hold and still_stands(seen, self._camera_id, arm.state.tick - self._grip.firm_tick):
             self._grip.release()
             return self._fail(f"{hold.thing.name} is not in the gripper: it is seen where it was")
         if isinstance(do, AwaitTaken):
-            return self._offer(planner, body, state)
+            return self._offer(arm)
         if self._run is None and self._abandoned and not hold:
-            self._back_off(planner, body, state, self._abandoned)
+            self._back_off(arm, self._abandoned)
         elif self._run is None:
             if self._planning is None:
-                held, floor = self._camera_id if hold else None, floor_of(body)
+                held, floor = self._camera_id if hold else None, floor_of(arm.body)
                 things, numbers = located(command.things, seen, held, floor)
-                if self._put and (solid := self._put.at(state, seen)):
+                if self._put and (solid := self._put.at(arm.state, seen)):
                     things[f"{self._put.name} put down"] = solid
                 else:
                     self._put = None
@@ -243,107 +235,84 @@ class Manipulator:
                     self._camera_id = numbers.get(do.thing)
                 missing = None if hold else unseen(do, command.things, things)
                 if missing:
-                    return self._look_for(missing, command, planner, state, body, things)
-                work = self._work(planner, state, body, do, things)
+                    return self._look_for(missing, command, arm, things)
+                work = self._work(arm, do, things)
                 if isinstance(work, str):
                     return self._fail(work)
                 self._planning = self._pool.submit(work)
             if not self._in_time(self._planning, 0.0) or self._grip.moves:
                 return self._still(PLANNING)
             planning, self._planning = self._planning, None
-            return self._start_plan(planning.result(), planner, state, body, command)
-        return self._follow(planner, state, body, command)
+            return self._start_plan(planning.result(), arm, command)
+        return self._follow(arm, command)
 
-    def _start_plan(
-        self,
-        planned: Planned,
-        planner: ArmPlanner,
-        state: RobotState,
-        body: BodyDescription,
-        command: ArmCommand,
-    ) -> StepResult:
+    def _start_plan(self, planned: Planned, arm: ArmReading, command: ArmCommand) -> StepResult:
         """Start to execute a plan; plan again if it is outdated, and fail if there is none."""
         if isinstance(planned, NoWay):
             if self._detour or self._put:  # try without moving aside, and without this obstacle
                 self._detour, self._put = False, None
                 return self._still(PLANNING)
             return self._fail(planned.reason, approach(self._target, planned.stand_off))
-        if not begins_at(planned, sent_posture(planner, body, state)):
+        if not begins_at(planned, arm.sent_posture):
             self._detour = False
             return self._still(PLANNING)
         self._abandoned = None
-        self._begin(planner, planned, state)
-        return self._follow(planner, state, body, command)
+        self._begin(arm, planned)
+        return self._follow(arm, command)
 
     def _look_for(
-        self,
-        name: str,
-        command: ArmCommand,
-        planner: ArmPlanner,
-        state: RobotState,
-        body: BodyDescription,
-        things: Mapping[str, Solid],
+        self, name: str, command: ArmCommand, arm: ArmReading, things: Mapping[str, Solid]
     ) -> StepResult:
         """Hold still until a thing is seen; then move the arm aside, as it may hide the thing.
 
         A body that can drive looks elsewhere for a thing with a label instead.
         """
-        if not self._lookout.waits(state.tick):
-            elsewhere = (command.things[name].label or "") if body.has_base else ""
-            posture = None if elsewhere else self._lookout.aside(body)
+        if not self._lookout.waits(arm.state.tick):
+            elsewhere = (command.things[name].label or "") if arm.body.has_base else ""
+            posture = None if elsewhere else self._lookout.aside(arm.body)
             if posture is None:
                 return self._fail(f"{name} is not seen", seek=elsewhere)
-            work = self._work(planner, state, body, TakePosture(posture), things)
+            work = self._work(arm, TakePosture(posture), things)
             if isinstance(work, str):
                 return self._fail(work)
             self._detour, self._planning = True, self._pool.submit(work)
         return self._still(Idle("looking", f"looking for {name}"))
 
     def _work(
-        self,
-        planner: ArmPlanner,
-        state: RobotState,
-        body: BodyDescription,
-        do: ArmAction,
-        things: Mapping[str, Solid],
+        self, arm: ArmReading, do: ArmAction, things: Mapping[str, Solid]
     ) -> Callable[[], Planned] | str:
         """Return a function that plans an action, or why it cannot be planned."""
         if isinstance(do, Pick) and do.thing in things:
             self._target = thing_of(do.thing, things[do.thing])
         # a thing that has its place from the mission moves along with the body
-        drives = body.has_base and self._camera_id is not None
+        drives = arm.body.has_base and self._camera_id is not None
         now = WorkInputs(
-            state=state, body=body, things=things, hold=self._grip.hold, misses=self._misses,
-            drives=drives,
-        )  # fmt: skip
-        return work_for(planner, do, now)
+            arm=arm, things=things, hold=self._grip.hold, misses=self._misses, drives=drives
+        )
+        return work_for(do, now)
 
-    def _offer(self, planner: ArmPlanner, body: BodyDescription, state: RobotState) -> StepResult:
+    def _offer(self, arm: ArmReading) -> StepResult:
         """Hold still until a person pulls at the held thing, or takes it."""
-        hold, self._touch = self._grip.hold, self._touch or Touch(planner)
-        pulled = self._touch.is_pulled(body, state)
-        if hold and holds(planner, hold, state) and not pulled:
+        hold, self._touch = self._grip.hold, self._touch or Touch(arm.planner)
+        pulled = self._touch.is_pulled(arm)
+        if hold and arm.holds(hold) and not pulled:
             return self._still(Idle("offering", OFFERING.format(hold.thing.name)))
         if not pulled:
             self._grip.release()
         self._achieved = self._success(self._grip.text)
         return self._still(Idle("done", ""), replace(self._achieved, reason=""))
 
-    def _back_off(
-        self, planner: ArmPlanner, body: BodyDescription, state: RobotState, left: Plan
-    ) -> None:
+    def _back_off(self, arm: ArmReading, left: Plan) -> None:
         """Start to back off from a thing that is not held; afterwards the arm plans again."""
         self._abandoned, self._detour = left, True
-        posture, put_down = sent_posture(planner, body, state), left.phases[-1].name == "retreat"
-        back = rest_of_place(left, posture) if put_down else planner.back_off(left, posture)
-        self._begin(planner, back, state)
+        posture, put_down = arm.sent_posture, left.phases[-1].name == "retreat"
+        back = rest_of_place(left, posture) if put_down else arm.planner.back_off(left, posture)
+        self._begin(arm, back)
 
-    def _press(
-        self, planner: ArmPlanner, body: BodyDescription, state: RobotState, do: Press, over: bool
-    ) -> StepResult:
+    def _press(self, arm: ArmReading, do: Press, *, over: bool) -> StepResult:
         """Continue to press until the force is reached or the way is `over`; then back off."""
-        self._touch = self._touch or Touch(planner)
-        pressure = self._touch.pressure(body, state)
+        self._touch = self._touch or Touch(arm.planner)
+        pressure = self._touch.pressure(arm)
         if over or (pressure and pressure.reaches(do.force)):
             touched = pressure is not None and pressure.touched
             if touched:
@@ -352,61 +321,57 @@ class Manipulator:
             else:
                 self._failure = f"nothing was touched, {do.depth * 100:g} cm behind that place"
             self._abandoned, self._detour = self._plan, True
-            posture = sent_posture(planner, body, state)
-            back = planner.after_press(self._plan, posture, do.seconds if touched else 0.0)
-            self._begin(planner, back, state)
-        return self._moving(state)
+            hold_s = do.seconds if touched else 0.0
+            self._begin(arm, arm.planner.after_press(self._plan, arm.sent_posture, hold_s))
+        return self._moving(arm)
 
-    def _begin(self, planner: ArmPlanner, plan: Plan, state: RobotState) -> None:
-        gripper = planner.arm.gripper
+    def _begin(self, arm: ArmReading, plan: Plan) -> None:
+        gripper = arm.planner.arm.gripper
         self._plan, self._put_down = plan, None
-        self._run = PhaseRun(plan.phases, gripper.name if gripper else "", state.tick)
+        self._run = PhaseRun(plan.phases, gripper.name if gripper else "", arm.state.tick)
         if self._grip.hold:
-            self._grip.make_firm(planner, self._run, state)
+            self._grip.make_firm(arm, self._run)
 
-    def _follow(
-        self, planner: ArmPlanner, state: RobotState, body: BodyDescription, command: ArmCommand
-    ) -> StepResult:
+    def _follow(self, arm: ArmReading, command: ArmCommand) -> StepResult:
         """Execute one step of the current plan."""
-        run, plan, hold = self._run, self._plan, self._grip.hold
+        run, plan, hold, tick = self._run, self._plan, self._grip.hold, arm.state.tick
         assert run
-        if hold and run.phase and run.phase.name in CARRYING and not holds(planner, hold, state):
-            return self._missed(planner, body, state)
-        waits = run.wait(state.tick, *pace(body, state))
+        if hold and run.phase and run.phase.name in CARRYING and not arm.holds(hold):
+            return self._missed(arm)
+        waits = run.wait(tick, *pace(arm.body, arm.state))
         if run.waited > WAIT_TICKS:
             return self._held_up(f"{waits} is held back for {WAIT_TICKS * TICK_S:g} s")
-        if off := off_from(body, state, run.expected(state.tick), "path_tolerance"):
+        if off := off_from(arm.body, arm.state, run.expected(tick), "path_tolerance"):
             return self._held_up(off)
-        grips = run.phase is not None and gripper_moves(planner, state, body, run.phase)
+        grips = run.phase is not None and arm.gripper_moves(run.phase)
         presses = run.phase is not None and run.phase.name == "press"
-        over = run.advance(state.tick, grips=grips)
+        over = run.advance(tick, grips=grips)
         if presses and isinstance(command.do, Press):
-            return self._press(planner, body, state, command.do, over is not None)
+            return self._press(arm, command.do, over=over is not None)
         if over and over.name == "close" and plan.hold:
-            closed = sent_to(planner, body, state, plan.hold.grip)  # False if safety holds it back
-            if not (closed and holds(planner, plan.hold, state)):
-                return self._missed(planner, body, state)
+            closed = arm.sent_to(plan.hold.grip)  # False if safety holds it back
+            if not (closed and arm.holds(plan.hold)):
+                return self._missed(arm)
             assert self._target
-            posture = measured_posture(planner, state)
-            self._grip.take(hold := planner.gripped(plan.hold, self._target, posture))
+            hold = arm.planner.gripped(plan.hold, self._target, arm.measured_posture)
+            self._grip.take(hold)
             self._achieved = self._success(self._grip.text)
         if over and over.name in ("close", "squeeze") and hold:
-            if not holds(planner, hold, state):
-                return self._missed(planner, body, state)
-            self._grip.make_firm(planner, run, state)
+            if not arm.holds(hold):
+                return self._missed(arm)
+            self._grip.make_firm(arm, run)
         if over and over.name == "lower" and hold:
-            thing = placed(planner, measured_posture(planner, state), command.do, hold, body)
-            self._put_down = self._success(placed=thing)
+            self._put_down = self._success(placed=placed(arm, command.do, hold))
         if over and over.name == "open" and hold:
-            self._let_go(state)
+            self._let_go(arm)
         if over and over.name == "grip":
             assert over.gripper is not None
-            self._grip.close_at(planner, state, over.gripper)
+            self._grip.close_at(arm, over.gripper)
         if run.phase is None:
-            return self._end(body, state, run, command.do)
-        return self._moving(state)
+            return self._end(arm, run, command.do)
+        return self._moving(arm)
 
-    def _missed(self, planner: ArmPlanner, body: BodyDescription, state: RobotState) -> StepResult:
+    def _missed(self, arm: ArmReading) -> StepResult:
         """Back off from a thing that was not caught; afterwards try another grasp.
 
         A command that is not a pick fails: it has lost the thing that it moves.
@@ -417,8 +382,8 @@ class Manipulator:
             return self._fail(f"{lost.thing.name} has slipped out of the gripper")
         self._misses += 1
         self._achieved = StepOutcome()
-        self._back_off(planner, body, state, self._plan)
-        return self._moving(state)
+        self._back_off(arm, self._plan)
+        return self._moving(arm)
 
     def _held_up(self, why: str) -> StepResult:
         """Plan again from the current posture after a hold-up; fail after too many."""
@@ -428,7 +393,7 @@ class Manipulator:
         self._interrupt()
         return self._still(PLANNING)
 
-    def _let_go(self, state: RobotState) -> None:
+    def _let_go(self, arm: ArmReading) -> None:
         """Record that the held thing was put down, maybe by an earlier command."""
         done, self._put_down = self._put_down, None
         assert done
@@ -438,7 +403,7 @@ class Manipulator:
         if done.number == self._number:
             self._achieved = done
         if self._camera_id is not None:  # other things have a place in the mission
-            self._put = PutDown(name=done.placed[0], solid=done.placed[1], state=state)
+            self._put = PutDown(name=done.placed[0], solid=done.placed[1], state=arm.state)
 
     def _success(self, reason: str = "", placed: tuple[str, Solid] | None = None) -> StepOutcome:
         return StepOutcome(
@@ -449,31 +414,29 @@ class Manipulator:
             placed=placed,
         )
 
-    def _end(
-        self, body: BodyDescription, state: RobotState, run: PhaseRun, do: ArmAction
-    ) -> StepResult:
+    def _end(self, arm: ArmReading, run: PhaseRun, do: ArmAction) -> StepResult:
         """End a command after its last phase, once the joints are within their tolerances."""
-        assert body.arm
+        assert arm.body.arm
         last = self._plan.phases[-1].arm
         end = dict(zip(last.names, last.positions[-1].tolist(), strict=True)) if last else {}
-        if off := off_from(body, state, end, "goal_tolerance"):
-            late = run.over_for(state.tick) * TICK_S > body.arm.goal_time
-            return self._held_up(off) if late else self._moving(state)
+        if off := off_from(arm.body, arm.state, end, "goal_tolerance"):
+            late = run.over_for(arm.state.tick) * TICK_S > arm.body.arm.goal_time
+            return self._held_up(off) if late else self._moving(arm)
         if self._detour and not self._achieved.number:
             why = self._failure or (MISSED if self._misses >= TRIES else "")
             self._drop()
             return self._fail(why) if why else self._still(PLANNING)
         if not self._achieved.number:
             text = self._grip.text
-            if text and names_gripper(body, do):
+            if text and names_gripper(arm.body, do):
                 text = f"{text}, {GRIPPER_STAYS}"
             self._achieved = self._success(text)
         self._drop()
         return self._still(Idle("done", self._achieved.reason), self._achieved)
 
-    def _moving(self, state: RobotState) -> StepResult:
+    def _moving(self, arm: ArmReading) -> StepResult:
         assert self._run
-        return moving(self._run, state.tick, self._number, self._behaviour)
+        return moving(self._run, arm.state.tick, self._number, self._behaviour)
 
     def _fail(self, reason: str, approach: Target | None = None, seek: str = "") -> StepResult:
         self._interrupt()
@@ -490,7 +453,7 @@ class Manipulator:
         return intent, replace(outcome, number=self._number)
 
     def _interrupt(self) -> None:
-        """Drop the plan, but remember that the hand may be at its thing; see `is_at`."""
+        """Drop the plan, but remember it: the hand may be at its thing (`is_at_thing`)."""
         left = self._abandoned or (self._plan if self._run else None)
         self._drop()
         self._abandoned = left
