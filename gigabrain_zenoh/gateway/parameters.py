@@ -24,7 +24,6 @@ KINDS: Mapping[type, tuple[int, str]] = {
     tuple: (9, "string_array_value"),
 }
 READ_ONLY = "is read-only; set it in the part `ros2` of the deployment file, and start again"
-DEPTH_RECURSIVE = 0
 MAX_NAMES = 1000  # of one request
 
 

@@ -22,7 +22,7 @@ UNUSED = ("scipy.linalg", "coverage", "cffi")
 PARTS = ("numba", "numba.np.arraymath", "numba.core.typing.cffi_utils")
 
 F = TypeVar("F", bound=Callable[..., object])
-NONE, ONE, TWO = np.int64(0), np.int64(1), np.int64(2)  # each literal would be compiled separately
+NONE = np.int64(0)  # a literal would be compiled separately
 
 
 @functools.cache

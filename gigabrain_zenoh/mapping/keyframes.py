@@ -153,15 +153,6 @@ def seen_through(mapped: Points, scan: Points, pose: Floats) -> float:
     return through / (through + hit) if through + hit >= MIN_SEEN_POINTS else np.nan
 
 
-def share_hit(mapped: Points, scan: Points, pose: Floats) -> float:
-    """Return the share of the points `mapped` (n, 2) that a scan at `pose` hits as well."""
-    if not len(mapped):
-        return 1.0
-    nearest, farthest = _range_limits(scan)
-    _, hit = _count_seen(mapped, nearest, farthest, np.array(pose))
-    return hit / len(mapped)
-
-
 @kernel
 def _bearing_bin(x: float, y: float) -> int:
     return int((np.arctan2(y, x) / (2 * np.pi) + 1.0) * BEARING_BINS) % BEARING_BINS

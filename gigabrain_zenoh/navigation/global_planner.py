@@ -285,25 +285,14 @@ class Frontier:
         return self.cost - SIZE_GAIN * min(self.size, MAX_SIZE_M)
 
 
-def next_frontier(
+def frontiers(
     costmap: Costmap, robot: Point, blacklist: Iterable[Point], search: GridSearch
-) -> Frontier | None:
-    """Return the best frontier; None when everything reachable is explored.
+) -> list[Frontier]:
+    """Return all reachable frontiers that are wide enough, except those near the blacklist.
 
     The blacklist holds places that the robot could not reach, and visited places where unknown
     space remains.
     """
-    return min(
-        frontiers(costmap, robot, blacklist, search),
-        key=lambda frontier: frontier.score,
-        default=None,
-    )
-
-
-def frontiers(
-    costmap: Costmap, robot: Point, blacklist: Iterable[Point], search: GridSearch
-) -> list[Frontier]:
-    """Return all reachable frontiers that are wide enough, except those near the blacklist."""
     start = costmap.cell(*robot)
     if start is None:
         return []

@@ -239,13 +239,6 @@ class Probe:
             raise Failed(f"only {len(ticks)} commands received within {passed} ticks")
         return p99_ms
 
-    def travel_until_rest(self, start: RobotState) -> float:
-        """Return the odometry's path length from `start` to the first rest [m]. Raises Failed."""
-        path_m = path_until_rest(self.since(start), at_rest)
-        if path_m is None:
-            raise Failed("the body has not come to rest")
-        return path_m
-
 
 def path_until_rest(
     states: Sequence[RobotState], rests: Callable[[RobotState], bool]

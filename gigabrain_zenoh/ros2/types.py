@@ -53,10 +53,6 @@ class Types:
         """Return the names of all message types."""
         return tuple(sorted(self._store.fielddefs))
 
-    def is_interface(self, name: str) -> bool:
-        """Return whether `name` is a known service or action."""
-        return name in self._interfaces
-
     def encode(self, name: str, message: object) -> bytes:
         """Return the message as CDR, little-endian, with its header of 4 bytes."""
         return bytes(self._store.serialize_cdr(message, self.known(name), little_endian=True))

@@ -12,7 +12,7 @@ from gigabrain_schemas.requests import ReleaseRequest
 from gigabrain_schemas.topics import RELEASE
 from gigabrain_zenoh.client.robot import Robot
 from gigabrain_zenoh.errors import Refused
-from gigabrain_zenoh.qa.probe import Probe, probing
+from gigabrain_zenoh.qa.probe import Probe, at_rest, path_until_rest, probing
 from gigabrain_zenoh.testing.processes import Home, endpoint_of
 from gigabrain_zenoh.testing.waiting import until
 
@@ -51,7 +51,9 @@ async def test_it_stops_the_body_and_keeps_it_stopped(robot: Probe) -> None:
     assert (reply.ok, reply.gate.mode) == (True, "latched")
     assert reply.gate.estop_generation == generation + 1
     await robot.ticks(100)
-    assert robot.travel_until_rest(start) <= 0.06
+    path = path_until_rest(robot.since(start), at_rest)
+    assert path is not None
+    assert path <= 0.06
     assert robot.distance_from(start) <= 0.06
     assert robot.state.gate.mode == "latched"
     assert [cause.code for cause in robot.state.gate.causes] == ["estop"]

@@ -153,7 +153,6 @@ def test_definitions_of_ones_own_are_read(tmp_path: Path) -> None:
     request = types.make("my_msgs/srv/Fetch_Request", thing=thing)
     payload = types.encode("my_msgs/srv/Fetch_Request", request)
     assert types.decode("my_msgs/srv/Fetch_Request", payload).thing.name == "a"
-    assert types.is_interface("my_msgs/srv/Fetch")
     with pytest.raises(BadPayload, match="at most 5 bytes"):
         types.from_dict("my_msgs/msg/Thing", {"name": "abcdef"})
     with pytest.raises(BadPayload, match="at most 2 elements"):

@@ -90,7 +90,7 @@ class Ros2Driver(Driver):
         self._battery, self._imu = Recent[Battery](), Recent[ImuData]()
         self._joints = Recent[tuple[Joint, ...]]()
         self._wanted = ZERO
-        self._wanted_ns = self._sent_ns = self._well_ns = self._clock.now_ns()
+        self._sent_ns = self._well_ns = self._clock.now_ns()
         self._commanded_ns = self._clock.now_ns()
         # a little early, because checks are periodic
         self._repeat_ns = round(1e9 / topics.command.hz) - GUARD_PERIOD_NS // 2
