@@ -1,6 +1,6 @@
-"""Kinematics of wheels and legs, dead reckoning, and a trot. Pure; imports no bus.
+"""Kinematics of wheels and legs, odometry, and a trot controller. Pure; imports no bus.
 
-Imports `driver.robot` at most. Bodies, `sim` and `emulators` use it.
+Imports only `driver.robot`. Bodies, `sim` and `emulators` use it.
 """
 
 Vector = tuple[float, float, float]  # x, y, z

@@ -1,7 +1,7 @@
-"""From a body's velocity to its wheels and back, and dead reckoning by how the wheels turned.
+"""Kinematics of wheeled bases in both directions, and wheel odometry.
 
-Pure; SI units; x forward, y left. What holds for speeds holds for small distances: `to_body` of
-wheel angles [rad] is how far the body has moved [m, m, rad].
+Pure; SI units; x forward, y left. The same equations hold for speeds and for small distances:
+`to_body` of wheel rotations [rad] is the body's motion [m, m, rad].
 """
 
 import abc
@@ -14,7 +14,7 @@ import numpy as np
 from gigabrain_drivers.driver.robot import RobotFile
 from gigabrain_schemas.base import Pose
 
-MEASURES = {  # of each drive type with wheels
+MEASURES = {  # required fields of each drive type with wheels
     "differential": ("wheel_radius", "wheel_separation"),
     "skid_steer": ("wheel_radius", "wheel_separation"),
     "mecanum": ("wheel_radius", "wheel_separation", "wheel_base"),
@@ -24,7 +24,7 @@ MEASURES = {  # of each drive type with wheels
 
 
 class Twist(NamedTuple):
-    """A body's velocity, or how far it has moved in a moment."""
+    """A body's velocity, or its motion in a short time."""
 
     linear_x: float  # [m/s] or [m]
     linear_y: float
@@ -34,20 +34,20 @@ class Twist(NamedTuple):
 class Base(abc.ABC):
     """A base on wheels. Wheel speeds [rad/s] are positive where the wheel rolls forward."""
 
-    wheels: tuple[str, ...]  # their names, in the order of all tuples here
+    wheels: tuple[str, ...]  # names of the wheels, in the order of all tuples here
 
     @abc.abstractmethod
     def to_wheels(self, twist: Twist) -> tuple[float, ...]:
-        """Return the speed of each wheel; what the base cannot do is left out."""
+        """Return the speed of each wheel; motion that the base cannot do is ignored."""
 
     @abc.abstractmethod
     def to_body(self, wheels: tuple[float, ...]) -> Twist:
-        """Return the velocity of the body when its wheels do not slip."""
+        """Return the velocity of a body whose wheels do not slip."""
 
 
 @dataclass(frozen=True)
 class Differential(Base):
-    """Two driven wheels on one axle; it cannot go sideways."""
+    """Two driven wheels on one axle; it cannot move sideways."""
 
     radius: float  # [m]
     separation: float  # [m], between the wheels
@@ -55,12 +55,12 @@ class Differential(Base):
     wheels = ("left", "right")
 
     def to_wheels(self, twist: Twist) -> tuple[float, ...]:
-        """(left, right) [rad/s]."""
+        """Return (left, right) [rad/s]."""
         turn = twist.angular_z * self.separation / 2
         return (twist.linear_x - turn) / self.radius, (twist.linear_x + turn) / self.radius
 
     def to_body(self, wheels: tuple[float, ...]) -> Twist:
-        """Linear along x and turning about z."""
+        """Return the velocity along x and about z."""
         left, right = wheels
         forward, turn = (left + right) / 2 * self.radius, (right - left) * self.radius
         return Twist(forward, 0.0, turn / self.separation)
@@ -68,30 +68,32 @@ class Differential(Base):
 
 @dataclass(frozen=True)
 class SkidSteer(Base):
-    """Four fixed wheels that scrub over the floor in turns; those of a side turn alike."""
+    """Four fixed wheels that scrub over the floor in turns; both wheels of a side turn alike."""
 
     radius: float  # [m]
-    effective_track: float  # [m], between rolling wheels that would turn the body as much
+    effective_track: float  # [m], separation of a differential base that turns as fast
 
     wheels = ("front_left", "front_right", "rear_left", "rear_right")
 
     def to_wheels(self, twist: Twist) -> tuple[float, ...]:
         """(front left, front right, rear left, rear right) [rad/s]."""
-        return 2 * self._rolling.to_wheels(twist)
+        return 2 * self._differential.to_wheels(twist)
 
     def to_body(self, wheels: tuple[float, ...]) -> Twist:
-        """Linear along x and turning about z, by the mean of each side."""
+        """Return the velocity along x and about z, from the mean of each side."""
         front_left, front_right, rear_left, rear_right = wheels
-        return self._rolling.to_body(((front_left + rear_left) / 2, (front_right + rear_right) / 2))
+        return self._differential.to_body(
+            ((front_left + rear_left) / 2, (front_right + rear_right) / 2)
+        )
 
     @property
-    def _rolling(self) -> Differential:
+    def _differential(self) -> Differential:
         return Differential(self.radius, self.effective_track)
 
 
 @dataclass(frozen=True)
 class Mecanum(Base):
-    """Four wheels with rollers at 45 degrees, in an X seen from above."""
+    """Four wheels with rollers at 45 degrees, which form an X seen from above."""
 
     radius: float  # [m]
     separation: float  # [m], left to right
@@ -106,7 +108,7 @@ class Mecanum(Base):
         return tuple(speed / self.radius for speed in speeds)
 
     def to_body(self, wheels: tuple[float, ...]) -> Twist:
-        """The velocity that fits all four best (least squares)."""
+        """Return the least-squares velocity of the four wheels."""
         front_left, front_right, rear_left, rear_right = (w * self.radius / 4 for w in wheels)
         return Twist(
             front_left + front_right + rear_left + rear_right,
@@ -124,30 +126,30 @@ class Omni(Base):
     """Three omnidirectional wheels on a circle, 120 degrees apart, one of them at the back."""
 
     radius: float  # [m]
-    circle: float  # [m], radius of the circle on which they stand
+    circle: float  # [m], radius of the circle through the wheels
 
     wheels = ("left", "back", "right")
 
     def to_wheels(self, twist: Twist) -> tuple[float, ...]:
-        """(left, back, right) [rad/s]; all turn the body counter-clockwise."""
+        """Return (left, back, right) [rad/s]; positive speeds turn the body counter-clockwise."""
         wheels = self._matrix @ twist / self.radius
         return tuple(wheels.tolist())
 
     def to_body(self, wheels: tuple[float, ...]) -> Twist:
-        """The only velocity that turns the wheels like this."""
+        """Return the only velocity that turns the wheels at these speeds."""
         return Twist(*np.linalg.solve(self._matrix, np.array(wheels) * self.radius).tolist())
 
     @property
     def _matrix(self) -> "np.ndarray[tuple[int, int], np.dtype[np.float64]]":
-        directions = np.radians((150.0, -90.0, 30.0))  # in which each wheel rolls
+        directions = np.radians((150.0, -90.0, 30.0))  # rolling direction of each wheel
         return np.stack([np.cos(directions), np.sin(directions), np.full(3, self.circle)], axis=1)
 
 
 @dataclass(frozen=True)
 class Ackermann(Base):
-    """A car, as the bicycle in its middle: rear wheels drive, front wheels steer.
+    """A car, as a bicycle model: rear wheels drive, front wheels steer.
 
-    It cannot turn on the spot: at a standstill the steering is straight.
+    It cannot turn on the spot: at zero speed it steers straight.
     """
 
     radius: float  # [m], of the rear wheels
@@ -157,7 +159,7 @@ class Ackermann(Base):
     wheels = ("drive", "steering")
 
     def to_wheels(self, twist: Twist) -> tuple[float, ...]:
-        """(rear wheels [rad/s], steering angle [rad], positive to the left)."""
+        """Return (rear wheels [rad/s], steering angle [rad], positive to the left)."""
         drive = twist.linear_x / self.radius
         if twist.linear_x == 0:
             return drive, 0.0
@@ -165,7 +167,7 @@ class Ackermann(Base):
         return drive, min(max(steering, -self.max_steering), self.max_steering)
 
     def to_body(self, wheels: tuple[float, ...]) -> Twist:
-        """The velocity of the middle of the rear axle."""
+        """Return the velocity of the rear axle's center."""
         drive, steering = wheels
         forward = drive * self.radius
         return Twist(forward, 0.0, forward * math.tan(steering) / self.wheel_base)
@@ -173,9 +175,9 @@ class Ackermann(Base):
 
 @dataclass(frozen=True)
 class AckermannAxles(Base):
-    """All four corners of a car: both rear wheels drive, both front wheels steer.
+    """The four wheels of a car: both rear wheels drive, both front wheels steer.
 
-    Each front wheel steers at its own angle, so that all wheels roll round one center. The wheels'
+    Each front wheel steers at its own angle, so that all wheels roll about one center. The wheels'
     values are speeds [rad/s] and angles [rad], positive to the left.
     """
 
@@ -185,47 +187,47 @@ class AckermannAxles(Base):
     wheels = ("rear_left", "rear_right", "steer_left", "steer_right")
 
     def to_wheels(self, twist: Twist) -> tuple[float, ...]:
-        """(rear left, rear right [rad/s], front left, front right [rad])."""
+        """Return (rear left, rear right [rad/s], front left, front right [rad])."""
         drive, steering = self.car.to_wheels(twist)
-        bend = math.tan(steering) / self.car.wheel_base  # [1/m], of the middle of the rear axle
-        inner = 0.5 * self.separation * bend
-        along = self.car.wheel_base * bend
-        left, right = math.atan2(along, 1.0 - inner), math.atan2(along, 1.0 + inner)
-        return drive * (1.0 - inner), drive * (1.0 + inner), left, right
+        curvature = math.tan(steering) / self.car.wheel_base  # [1/m], of the rear axle's center
+        lateral = 0.5 * self.separation * curvature
+        forward = self.car.wheel_base * curvature
+        left, right = math.atan2(forward, 1.0 - lateral), math.atan2(forward, 1.0 + lateral)
+        return drive * (1.0 - lateral), drive * (1.0 + lateral), left, right
 
     def to_body(self, wheels: tuple[float, ...]) -> Twist:
-        """The velocity of the middle of the rear axle, by its wheels and the steering angles."""
+        """Return the velocity of the rear axle's center, from all wheels."""
         rear_left, rear_right, left, right = wheels
         base, half = self.car.wheel_base, 0.5 * self.separation
-        bend_left = math.tan(left) / (base + half * math.tan(left))
-        bend_right = math.tan(right) / (base - half * math.tan(right))
+        curvature_left = math.tan(left) / (base + half * math.tan(left))
+        curvature_right = math.tan(right) / (base - half * math.tan(right))
         forward = (rear_left + rear_right) / 2 * self.car.radius
-        return Twist(forward, 0.0, forward * (bend_left + bend_right) / 2)
+        return Twist(forward, 0.0, forward * (curvature_left + curvature_right) / 2)
 
 
 def missing_measures(robot: RobotFile) -> list[str]:
-    """The measures of its wheels that a robot's file does not give."""
+    """Return the required wheel fields that a robot's file lacks."""
     return [name for name in MEASURES.get(robot.drive_type, ()) if not getattr(robot, name)]
 
 
 def wheels_of(robot: RobotFile) -> Base | None:
-    """The wheels of a robot's file, or None where it has none or does not give their measures."""
+    """Return the wheels of a robot's file; None if it has none, or lacks their fields."""
     if robot.drive_type not in MEASURES or missing_measures(robot):
         return None
-    radius, across, along = robot.wheel_radius, robot.wheel_separation, robot.wheel_base
+    radius, separation, wheel_base = robot.wheel_radius, robot.wheel_separation, robot.wheel_base
     if robot.drive_type == "differential":
-        return Differential(radius, across)
+        return Differential(radius, separation)
     if robot.drive_type == "skid_steer":
-        return SkidSteer(radius, robot.effective_track or across)
+        return SkidSteer(radius, robot.effective_track or separation)
     if robot.drive_type == "mecanum":
-        return Mecanum(radius, across, along)
+        return Mecanum(radius, separation, wheel_base)
     if robot.drive_type == "omni":
-        return Omni(radius, across / math.sqrt(3.0))
-    return Ackermann(radius, along)
+        return Omni(radius, separation / math.sqrt(3.0))
+    return Ackermann(radius, wheel_base)
 
 
 def advance_pose(pose: Pose, moved: Twist) -> Pose:
-    """Return the pose after a small step in the body's frame, taken at the mid heading."""
+    """Return the pose after a small step in the body's frame, integrated at the mid heading."""
     middle = pose.yaw + moved.angular_z / 2
     cos, sin = math.cos(middle), math.sin(middle)
     return Pose(
@@ -236,7 +238,7 @@ def advance_pose(pose: Pose, moved: Twist) -> Pose:
 
 
 def step_between(start: Pose, end: Pose) -> Twist:
-    """The small step, in the body's own frame, that leads from one pose to another."""
+    """Return the small step, in the body's frame, from one pose to another."""
     turn = math.remainder(end.yaw - start.yaw, math.tau)
     middle, x, y = start.yaw + turn / 2, end.x - start.x, end.y - start.y
     cos, sin = math.cos(middle), math.sin(middle)
@@ -251,25 +253,25 @@ class WheelOdometry:
         self.pose = Pose(x=0.0, y=0.0, yaw=0.0)
 
     def add(self, wheels: tuple[float, ...]) -> None:
-        """Add the angles by which the wheels have turned [rad], as in `base.wheels`."""
+        """Add the wheels' rotations [rad], in the order of `base.wheels`."""
         self.pose = advance_pose(self.pose, self._base.to_body(wheels))
 
 
 class Encoders:
-    """Counters that wrap, read as the angles by which wheels turned between two looks."""
+    """Converts encoder counts, which wrap, to the rotations of wheels between two readings."""
 
     def __init__(self, per_turn: float, bits: int) -> None:
         self._radians, self._range = math.tau / per_turn, 1 << bits
         self._last: tuple[int, ...] | None = None
 
     def turned(self, counts: tuple[int, ...]) -> tuple[float, ...]:
-        """Return the angles since the last call [rad]; zero at the first."""
+        """Return the rotations since the last call [rad]; zero at the first call."""
         last, self._last = self._last or counts, counts
         pairs = zip(counts, last, strict=True)
         return tuple(self._radians * self._wrapped(now - before) for now, before in pairs)
 
     def restart(self) -> None:
-        """Count from the next values on: the counters may have been reset."""
+        """Start at the next counts, because the counters may have been reset."""
         self._last = None
 
     def _wrapped(self, difference: int) -> int:

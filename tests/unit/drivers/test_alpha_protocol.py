@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from gigabrain_drivers.bodies.alpha import protocol as alpha
 from gigabrain_drivers.bodies.alpha.protocol import AlphaDecoder, AlphaFrame, State, Walk
-from gigabrain_drivers.kinematics.legs import WALKER, Gait, Senses, is_sound
+from gigabrain_drivers.kinematics.legs import WALKER, Gait, Senses, is_valid_gait
 from gigabrain_drivers.kinematics.wheels import Twist
 from gigabrain_drivers.links.tcp_link import address
 from gigabrain_zenoh.errors import ConfigError
@@ -119,7 +119,7 @@ def test_the_limits_of_the_firmware_page_are_obeyed_though_the_wire_rounds_them(
     (frame,) = AlphaDecoder().feed(alpha.encode_walk(Walk(1000, gait), 2))
     walk = alpha.decode_walk(frame)
     assert walk
-    assert is_sound(walk.gait) == sound
+    assert is_valid_gait(walk.gait) == sound
 
 
 def test_a_state_there_and_back() -> None:

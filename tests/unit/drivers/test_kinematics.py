@@ -1,4 +1,4 @@
-"""Kinematics, both ways: to the wheels or the gait, and back to the body."""
+"""Kinematics in both directions: from the body to its wheels or its gait, and back."""
 
 import math
 
@@ -31,25 +31,27 @@ def close(a: Twist, b: Twist, within: float = 1e-9) -> bool:
 
 
 @given(twists, lengths, lengths)
-def test_differential_there_and_back(twist: Twist, radius: float, separation: float) -> None:
+def test_differential_round_trip(twist: Twist, radius: float, separation: float) -> None:
     base = Differential(radius, separation)
     assert close(base.to_body(base.to_wheels(twist)), twist._replace(linear_y=0.0))
 
 
 @given(twists, lengths, lengths, lengths)
-def test_mecanum_there_and_back(twist: Twist, radius: float, across: float, along: float) -> None:
-    base = Mecanum(radius, across, along)
+def test_mecanum_round_trip(
+    twist: Twist, radius: float, separation: float, wheel_base: float
+) -> None:
+    base = Mecanum(radius, separation, wheel_base)
     assert close(base.to_body(base.to_wheels(twist)), twist)
 
 
 @given(twists, lengths, lengths)
-def test_omni_there_and_back(twist: Twist, radius: float, circle: float) -> None:
+def test_omni_round_trip(twist: Twist, radius: float, circle: float) -> None:
     base = Omni(radius, circle)
     assert close(base.to_body(base.to_wheels(twist)), twist)
 
 
 @given(speeds, st.floats(-0.75, 0.75), lengths, lengths)
-def test_ackermann_there_and_back(
+def test_ackermann_round_trip(
     forward: float, steering: float, radius: float, wheel_base: float
 ) -> None:
     base = Ackermann(radius, wheel_base)
@@ -58,7 +60,7 @@ def test_ackermann_there_and_back(
 
 
 @given(speeds, st.floats(-0.75, 0.75), lengths, lengths, st.floats(0.02, 0.5))
-def test_all_corners_of_a_car_there_and_back(
+def test_four_wheels_of_a_car_round_trip(
     forward: float, steering: float, radius: float, wheel_base: float, share: float
 ) -> None:
     base = AckermannAxles(Ackermann(radius, wheel_base), share * wheel_base)
@@ -74,13 +76,13 @@ def test_the_inner_front_wheel_of_a_car_steers_more_and_its_rear_wheel_rolls_slo
 
 
 @given(twists, lengths, lengths)
-def test_skid_steer_there_and_back(twist: Twist, radius: float, track: float) -> None:
+def test_skid_steer_round_trip(twist: Twist, radius: float, track: float) -> None:
     base = SkidSteer(radius, track)
     assert close(base.to_body(base.to_wheels(twist)), twist._replace(linear_y=0.0))
 
 
 @given(twists)
-def test_gait_there_and_back(twist: Twist) -> None:
+def test_gait_round_trip(twist: Twist) -> None:
     walker = Walker(max_frequency=30.0)
     assert close(walker.to_body(walker.to_gait(twist)), twist)
 
@@ -89,19 +91,19 @@ def test_gait_there_and_back(twist: Twist) -> None:
     "base", [Differential(0.033, 0.287), Mecanum(0.05, 0.3, 0.4), Omni(0.05, 0.125)]
 )
 @given(st.data())
-def test_wheels_there_and_back(base: Base, data: st.DataObject) -> None:
+def test_wheel_speeds_round_trip(base: Base, data: st.DataObject) -> None:
     twist = data.draw(twists)
     wheels = base.to_wheels(twist)
     again = base.to_wheels(base.to_body(wheels))
     assert all(abs(a - b) <= 1e-9 * 100 for a, b in zip(wheels, again, strict=True))
 
 
-def test_a_waffle_at_a_tenth_turns_its_wheels_like_this() -> None:
+def test_wheel_speeds_of_a_waffle() -> None:
     left, right = Differential(0.033, 0.287).to_wheels(Twist(0.1, 0.0, 0.5))
     assert (left, right) == pytest.approx((0.8560606, 5.2045455), abs=1e-6)
 
 
-def test_mycustombot_forwards() -> None:
+def test_wheel_speeds_of_mycustombot_driving_straight() -> None:
     assert Differential(0.08, 0.5).to_wheels(Twist(0.4, 0.0, 0.0)) == pytest.approx((5.0, 5.0))
 
 
@@ -110,7 +112,7 @@ def test_mecanum_sideways_to_the_left_turns_the_front_left_wheel_backwards() -> 
     assert wheels == pytest.approx((-2.0, 2.0, 2.0, -2.0))
 
 
-def test_omni_as_lekiwi_has_it() -> None:
+def test_omni_wheels_turn_as_those_of_lekiwi() -> None:
     # angles 240, 0 and 120 degrees minus 90; v = cos(a) x + sin(a) y + 0.125 w; radius 0.05
     left, back, right = Omni(0.05, 0.125).to_wheels(Twist(0.1, 0.0, 0.2))
     assert (left, back, right) == pytest.approx((-1.2320508, 0.5, 2.2320508), abs=1e-6)
@@ -127,23 +129,23 @@ def test_ackermann_cannot_turn_on_the_spot() -> None:
     assert base.to_body(base.to_wheels(Twist(0.0, 0.0, 1.0))) == (0.0, 0.0, 0.0)
 
 
-def test_ackermann_steers_no_further_than_it_can() -> None:
+def test_ackermann_limits_its_steering_angle() -> None:
     assert Ackermann(0.1, 0.5, max_steering=0.6).to_wheels(Twist(0.1, 0.0, 9.0))[1] == 0.6
 
 
-def test_a_faster_trot_first_takes_longer_strides_then_more_of_them() -> None:
+def test_with_the_speed_of_a_trot_first_strides_grow_then_their_frequency() -> None:
     walker = Walker()
     slow, fast = walker.to_gait(Twist(0.3, 0.0, 0.0)), walker.to_gait(Twist(0.6, 0.0, 0.0))
     assert (slow.stride_x, slow.frequency) == pytest.approx((0.12, 2.5))
     assert (fast.stride_x, fast.frequency) == pytest.approx((0.2, 3.0))
 
 
-def test_a_trot_that_is_too_fast_slows_all_its_parts_alike() -> None:
+def test_a_velocity_too_fast_for_a_trot_is_scaled_down() -> None:
     walker = Walker()
     assert walker.to_body(walker.to_gait(Twist(1.6, 0.0, 1.0))) == pytest.approx((0.8, 0.0, 0.5))
 
 
-def test_the_waffle_is_differential_and_the_robot_without_measures_has_no_wheels() -> None:
+def test_a_robot_without_its_wheel_radius_has_no_wheels() -> None:
     waffle = catalog.load_robot("turtlebot3_waffle")
     assert wheels_of(waffle) == Differential(0.033, 0.287)
     assert wheels_of(replace(waffle, wheel_radius=0.0)) is None

@@ -1,4 +1,4 @@
-"""Legs: their geometry both ways, gaits both ways, and odometry by what a robot feels."""
+"""Legs: kinematics and gaits in both directions, and odometry from a robot's sensors."""
 
 import math
 
@@ -14,7 +14,7 @@ from gigabrain_drivers.kinematics.legs import (
     LegGeometry,
     LegOdometry,
     Senses,
-    is_sound,
+    is_valid_gait,
 )
 from gigabrain_drivers.kinematics.wheels import Twist
 
@@ -26,22 +26,22 @@ twists = st.builds(Twist, st.floats(-0.5, 0.5), st.floats(-0.2, 0.2), st.floats(
 
 
 def angles_of(leg: int) -> st.SearchStrategy[Vector]:
-    """With the foot below the hip: one above it has been reached by another turn of the leg."""
-    bend = GEOMETRY.legs[leg].bend
+    """Draw joint angles with the foot below the hip; above it, the solution is not unique."""
+    knee_sign = GEOMETRY.legs[leg].knee_sign
     hips, knees = st.floats(-0.3, 1.2), st.floats(0.6, 2.5)
     return st.tuples(st.floats(-0.6, 0.6), hips, knees).map(
-        lambda a: (a[0], -bend * a[1], bend * a[2])
+        lambda a: (a[0], -knee_sign * a[1], knee_sign * a[2])
     )
 
 
 @given(st.data(), legs)
-def test_from_angles_to_the_foot_and_back(data: st.DataObject, number: int) -> None:
+def test_joint_angles_round_trip(data: st.DataObject, number: int) -> None:
     leg, angles = GEOMETRY.legs[number], data.draw(angles_of(number))
     assert leg.joints(leg.foot(angles)) == pytest.approx(angles, abs=1e-9)
 
 
 @given(st.data(), legs)
-def test_the_jacobian_is_how_the_foot_moves(data: st.DataObject, number: int) -> None:
+def test_the_jacobian_matches_finite_differences(data: st.DataObject, number: int) -> None:
     leg, angles, step = GEOMETRY.legs[number], data.draw(angles_of(number)), 1e-6
     for joint, column in enumerate(leg.jacobian(angles)):
         more, less = list(angles), list(angles)
@@ -52,21 +52,21 @@ def test_the_jacobian_is_how_the_foot_moves(data: st.DataObject, number: int) ->
 
 
 @given(twists)
-def test_a_velocity_is_a_gait_and_a_gait_a_velocity(twist: Twist) -> None:
+def test_velocity_round_trip(twist: Twist) -> None:
     gait = WALKER.to_gait(twist)
-    assert is_sound(gait)
+    assert is_valid_gait(gait)
     assert WALKER.to_body(gait) == pytest.approx(twist, abs=1e-9)
 
 
 @given(twists)
-def test_a_gait_becomes_the_same_gait_again(twist: Twist) -> None:
+def test_gait_round_trip(twist: Twist) -> None:
     gait = WALKER.to_gait(twist)
     again = WALKER.to_gait(WALKER.to_body(gait))
     for mine, its in zip(gait, again, strict=True):
         assert mine == pytest.approx(its, abs=1e-9)
 
 
-def test_alpha_at_a_walk() -> None:
+def test_gait_of_alpha_for_a_velocity() -> None:
     gait = WALKER.to_gait(Twist(0.36, 0.072, -0.9))
     assert gait == Gait(
         stride_x=pytest.approx(0.1),
@@ -79,7 +79,7 @@ def test_alpha_at_a_walk() -> None:
     )
 
 
-def test_standing_the_feet_are_under_the_hips_and_the_knees_face_each_other() -> None:
+def test_a_standing_body_has_feet_below_its_hips_and_knees_that_face_each_other() -> None:
     stand = GEOMETRY.standing(0.29)
     feet = [leg.foot(angles) for leg, angles in zip(GEOMETRY.legs, stand, strict=True)]
     assert feet[0] == pytest.approx((0.19, 0.135, -0.29))
@@ -90,7 +90,7 @@ def test_standing_the_feet_are_under_the_hips_and_the_knees_face_each_other() ->
     )  # fmt: skip
 
 
-def test_a_foot_out_of_reach_is_approached_as_far_as_the_leg_goes() -> None:
+def test_a_foot_position_out_of_reach_is_approached_with_a_straight_leg() -> None:
     leg = GEOMETRY.legs[0]
     x, y, z = leg.foot(leg.joints((0.19, 0.135, -1.0)))
     assert (x, y) == pytest.approx((0.19, 0.135), abs=0.05)
@@ -110,12 +110,12 @@ def test_a_foot_out_of_reach_is_approached_as_far_as_the_leg_goes() -> None:
         {"phases": (0.0, 0.5, 0.5, 1.0)},
     ],
 )
-def test_a_gait_that_legs_cannot_walk_is_not_sound(wrong: dict[str, object]) -> None:
-    assert not is_sound(WALKER.to_gait(Twist(0.3, 0.0, 0.0))._replace(**wrong))  # type: ignore[arg-type]
+def test_a_gait_beyond_the_limits_is_invalid(wrong: dict[str, object]) -> None:
+    assert not is_valid_gait(WALKER.to_gait(Twist(0.3, 0.0, 0.0))._replace(**wrong))  # type: ignore[arg-type]
 
 
 def walked(twist: Twist, seconds: float, lifted: tuple[int, ...] = ()) -> LegOdometry:
-    """Feet that stand on the floor while the body glides over them; some hang in the air."""
+    """Return the odometry of a body that moves at `twist`, with the feet `lifted` in the air."""
     odometry, passed = LegOdometry(GEOMETRY), 0.01
     contacts = tuple(leg not in lifted for leg in range(4))
     stand = GEOMETRY.standing(0.29)
@@ -132,7 +132,7 @@ def walked(twist: Twist, seconds: float, lifted: tuple[int, ...] = ()) -> LegOdo
 
 
 def _rates(columns: tuple[Vector, ...], wanted: Vector, radius: float) -> Vector:
-    """Joint rates that move the point where a rolling ball of `radius` touches as wanted."""
+    """Return the joint rates at which the contact point of a rolling ball moves as wanted."""
     import numpy as np
 
     matrix = np.array(columns).T
@@ -142,29 +142,29 @@ def _rates(columns: tuple[Vector, ...], wanted: Vector, radius: float) -> Vector
     return a, b, c
 
 
-def test_feet_that_stand_tell_how_the_body_moves() -> None:
+def test_feet_on_the_floor_measure_the_velocity() -> None:
     odometry = walked(Twist(0.2, 0.0, 0.0), 1.0)
     assert odometry.velocity == pytest.approx((0.2, 0.0, 0.0), abs=1e-3)
     assert odometry.pose.x == pytest.approx(0.2, abs=0.02)
 
 
-def test_feet_in_the_air_tell_nothing() -> None:
+def test_feet_in_the_air_measure_no_velocity() -> None:
     odometry = walked(Twist(0.2, 0.0, 0.0), 1.0, lifted=(0, 1, 2, 3))
     assert odometry.velocity == pytest.approx((0.0, 0.0, 0.0), abs=1e-9)
 
 
-def test_turning_on_the_spot_goes_nowhere() -> None:
+def test_turning_on_the_spot_does_not_change_the_position() -> None:
     odometry = walked(Twist(0.0, 0.0, 0.8), 1.0, lifted=(0, 3))
     assert (odometry.pose.x, odometry.pose.y) == pytest.approx((0.0, 0.0), abs=1e-3)
     assert odometry.pose.yaw == pytest.approx(0.8, abs=1e-9)
 
 
-def test_a_tilted_body_at_rest_stays_where_it_is() -> None:
+def test_a_tilted_body_at_rest_has_no_velocity() -> None:
     tilt = 0.1
     attitude = (math.sin(tilt / 2), 0.0, 0.0, math.cos(tilt / 2))
-    felt = (0.0, 9.81 * math.sin(tilt), 9.81 * math.cos(tilt))
+    acceleration = (0.0, 9.81 * math.sin(tilt), 9.81 * math.cos(tilt))
     odometry, still = LegOdometry(GEOMETRY), ((0.0, 0.0, 0.0),) * 4
-    senses = Senses(GEOMETRY.standing(0.29), still, (False,) * 4, attitude, (0.0, 0.0, 0.0), felt)
+    senses = Senses(GEOMETRY.standing(0.29), still, (False,) * 4, attitude, still[0], acceleration)
     for _ in range(100):
         odometry.update(senses, 0.01)
     assert odometry.velocity == pytest.approx((0.0, 0.0, 0.0), abs=1e-9)

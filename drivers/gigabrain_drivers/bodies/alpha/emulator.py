@@ -9,7 +9,7 @@ from gigabrain_drivers.bodies.alpha.driver import AlphaOptions
 from gigabrain_drivers.bodies.alpha.protocol import AlphaDecoder, AlphaFrame, State
 from gigabrain_drivers.emulators.base import Device, EmulatedBody, Port, Snapshot, Wire
 from gigabrain_drivers.emulators.ports import TcpPort
-from gigabrain_drivers.kinematics.legs import WALKER, Gait, Senses, by_leg, is_sound
+from gigabrain_drivers.kinematics.legs import WALKER, Gait, Senses, by_leg, is_valid_gait
 from gigabrain_drivers.kinematics.wheels import Twist
 
 LYING_M = 0.13  # height of the hips of a lying body
@@ -96,7 +96,7 @@ class Alpha(Device):
         if frame.type == alpha.PARK:
             return LYING
         command = alpha.decode_walk(frame) if frame.type == alpha.WALK else None
-        if command is None or not is_sound(command.gait):
+        if command is None or not is_valid_gait(command.gait):
             return None
         if self._last is not None and not alpha.is_newer(frame.sequence, self._last):
             return None
