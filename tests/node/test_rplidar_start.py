@@ -37,14 +37,14 @@ def decoded(model: Any, request: bytes, seconds: float) -> tuple[bytes, RplidarD
 def test_the_emulator_streams_at_its_models_rate(
     model: str, request_bytes: bytes, descriptor: str, blocks: int
 ) -> None:
-    """A capsule is only understood once the next has come, so one is missing in a second."""
+    """One capsule is missing, because a capsule is decoded with the next one."""
     first, decoder, found = decoded(model, request_bytes, 1.0)
 
     assert first == bytes.fromhex(descriptor)
     assert (found, decoder.errors) == (blocks, 0)
 
 
-def test_an_a2_does_not_turn_before_its_board_is_told_to_and_an_s2_stops_at_speed_zero() -> None:
+def test_an_a2_turns_after_a_command_to_its_board_and_an_s2_stops_at_speed_zero() -> None:
     assert decoded("a2m8", rplidar.request(rplidar.SCAN), 0.2)[2] == 0
     pwm = rplidar.request(rplidar.SET_PWM, (660).to_bytes(2, "little"))
     assert decoded("a2m8", rplidar.request(rplidar.SCAN) + pwm, 0.2)[2] == 400
@@ -53,7 +53,7 @@ def test_an_a2_does_not_turn_before_its_board_is_told_to_and_an_s2_stops_at_spee
 
 
 class Scripted:
-    """A lidar that has the given scan modes: answer type and microseconds a sample."""
+    """A lidar with the given scan modes: answer type, and microseconds per sample."""
 
     def __init__(self, typical: int, modes: list[tuple[int, int]]) -> None:
         self._typical, self._modes = typical, modes
@@ -81,14 +81,14 @@ A1_MODES = [(0x81, 500), (0x82, 250), (0x84, 125), (0x84, 125)]  # as a real A1 
 @pytest.mark.parametrize(
     ("firmware", "model", "scan_mode", "expected"),
     [
-        ((1, 29), 0x18, "auto", (EXPRESS, 1)),  # its typical mode, 84, is not understood here
+        ((1, 29), 0x18, "auto", (EXPRESS, 1)),  # its typical mode, 84, is not supported
         ((1, 29), 0x18, "standard", (STANDARD, 0)),
-        ((1, 20), 0x18, "auto", (EXPRESS, 0)),  # too old to be asked
+        ((1, 20), 0x18, "auto", (EXPRESS, 0)),  # too old to report its modes
         ((1, 15), 0x18, "auto", (STANDARD, 0)),  # too old for express
-        ((1, 1), 0x41, "auto", (EXPRESS, 1)),  # a C1 can be asked whatever its firmware
+        ((1, 1), 0x41, "auto", (EXPRESS, 1)),  # every C1 reports its modes
     ],
 )
-async def test_the_scan_mode_is_one_that_both_sides_know(
+async def test_the_scan_mode_is_supported_by_lidar_and_source(
     firmware: tuple[int, int], model: int, scan_mode: str, expected: tuple[int, int]
 ) -> None:
     info = Info(model, firmware, 7, "00" * 16)
@@ -97,7 +97,7 @@ async def test_the_scan_mode_is_one_that_both_sides_know(
 
 
 @pytest.mark.parametrize("firmware", [(1, 29), (1, 20)])
-async def test_a_scan_mode_that_the_lidar_has_not_is_refused(firmware: tuple[int, int]) -> None:
+async def test_a_scan_mode_that_the_lidar_lacks_is_refused(firmware: tuple[int, int]) -> None:
     info = Info(0x18, firmware, 7, "00" * 16)
 
     with pytest.raises(StartupError, match="no scan_mode 'dense'"):

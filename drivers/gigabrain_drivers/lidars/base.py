@@ -1,4 +1,4 @@
-"""The base of every lidar on a line of its own, how a body carries one, and its scans."""
+"""Base class of lidars on their own line, and conversion of their samples to scans."""
 
 import abc
 import itertools
@@ -24,25 +24,25 @@ Samples = NDArray[np.float64]
 Piece = TypeVar("Piece")
 MAX_SAMPLES = 20_000  # per turn; the fastest lidar here measures 3200
 CLOCKWISE = -math.pi / 180  # from degrees clockwise to radians counter-clockwise
-MIN_PERIODS = 0.25  # of the nominal period, for one turn; less is a backlog,
-MAX_PERIODS = 3.0  # and more is two turns mixed
+MIN_PERIODS = 0.25  # shortest turn, in nominal periods; a shorter one is a backlog,
+MAX_PERIODS = 3.0  # and a longer one is two turns mixed
 
 
 class ScanSource(abc.ABC):
     """A lidar that emits one LaserScan per turn, as the body's file describes it.
 
-    Scans run counter-clockwise in `lidar.beams` equal bins, bin 0 around straight ahead: inf where
-    the sensor saw no return, nan where it measured nothing. A source whose line is down keeps on
-    trying; it never raises.
+    Scans run counter-clockwise in `lidar.beams` equal bins; bin 0 is centered straight ahead. A
+    range is inf without a return, and nan without a measurement. A source never raises: it keeps
+    trying to connect.
     """
 
-    Options: ClassVar[type[ScanOptions]] = ScanOptions  # its part of a robot's file
-    turns_hz: ClassVar[float | None] = None  # turns a second, where they are fixed
-    samples_hz: ClassVar[float | None] = None  # samples a second, where that is known
+    Options: ClassVar[type[ScanOptions]] = ScanOptions  # the `scan` part of a robot's file
+    turns_hz: ClassVar[float | None] = None  # turns per second, if fixed
+    samples_hz: ClassVar[float | None] = None  # samples per second, if known
 
     def __init__(self, options: Any, lidar: Lidar, clock: Clock) -> None:
         self.options, self.lidar, self.clock = options, lidar, clock
-        self.emit: Callable[[LaserScan], None] = lambda scan: None  # the owner puts its own here
+        self.emit: Callable[[LaserScan], None] = lambda scan: None  # set by the owner
 
     @abc.abstractmethod
     def open(self) -> None:
@@ -50,7 +50,7 @@ class ScanSource(abc.ABC):
 
     @abc.abstractmethod
     async def close(self) -> None:
-        """Bring the lidar to rest and free its port; any number of times, in any state."""
+        """Stop the lidar and free its port. May be called any number of times, in any state."""
 
     @property
     @abc.abstractmethod
@@ -60,20 +60,20 @@ class ScanSource(abc.ABC):
     @property
     @abc.abstractmethod
     def problem(self) -> str:
-        """The reason in one line why there are no scans, or an empty text."""
+        """The reason in one line why there are no scans; empty while there are."""
 
 
 def source_class(name: str) -> type[ScanSource]:
-    """Return the scan source called `name`: one of ours, or one that a package offers.
+    """Return the scan source called `name`: one from `LIDARS`, or from another package.
 
-    Raises UnknownName listing the known ones, and ConfigError where it cannot be imported.
+    Raises UnknownName, which lists the known ones, or ConfigError if it cannot be imported.
     """
     source = load_plugin("lidar", name, shipped_hosts(LIDARS), "gigabrain.lidars")
     return cast("type[ScanSource]", source)
 
 
 def check_turns(name: str, lidar: Lidar | None) -> None:
-    """Raise ConfigError where the lidar called `name` cannot make the turns of `lidar`."""
+    """Raise ConfigError if a lidar called `name` cannot have the rate and beams of `lidar`."""
     source = source_class(name)
     turns_hz, samples_hz = source.turns_hz, source.samples_hz
     if lidar and turns_hz and lidar.rate_hz != turns_hz:
@@ -89,10 +89,10 @@ def check_turns(name: str, lidar: Lidar | None) -> None:
 
 
 def open_lidar(driver: Driver, clock: Clock) -> ScanSource | None:
-    """Open the lidar of `driver`'s link, whose scans become the driver's own; None without one.
+    """Open the lidar of `driver`'s link, and publish its scans as the driver's; None without one.
 
-    For a driver's `open`; its `close` awaits the `close` of what this returns. Raises ConfigError
-    when the body's file does not describe a lidar.
+    A driver calls this in `open`, and must close the returned source in its `close`. Raises
+    ConfigError if the body's file does not describe a lidar.
     """
     options: ScanOptions | None = driver.options.scan
     if options is None:
@@ -111,7 +111,7 @@ def open_lidar(driver: Driver, clock: Clock) -> ScanSource | None:
 
 
 class TurnBuffer(abc.ABC, Generic[Piece]):
-    """The turn that is being measured, in the pieces that came. Its size is bounded."""
+    """Collects the pieces of the current turn. Its size is bounded."""
 
     def __init__(self, lidar: Lidar) -> None:
         self._lidar = lidar
@@ -120,22 +120,19 @@ class TurnBuffer(abc.ABC, Generic[Piece]):
 
     @abc.abstractmethod
     def unpack(self, pieces: list[Piece]) -> tuple[Samples, Samples]:
-        """Angles (n,) [deg] clockwise, and distances (n,) [mm], of all samples in the pieces.
+        """Return angles (n,) [deg] clockwise, and distances (n,) [mm], of all samples.
 
-        0 mm where there was no return, nan where it cannot be trusted.
+        A distance is 0 without a return, and nan if it is not reliable.
         """
 
     def clear(self) -> None:
-        """Drop what was gathered."""
+        """Drop all pieces."""
         self._pieces: list[Piece] = []
         self._count = self._began_ns = self._last_ns = 0
-        self._whole = False  # whether it was seen from its start
+        self._start_seen = False  # False for the first turn after a gap
 
     def add(self, piece: Piece, count: int, now_ns: int) -> None:
-        """Add a piece with `count` samples.
-
-        After a whole turn of silence what was gathered before is dropped.
-        """
+        """Add a piece with `count` samples. Older pieces are dropped after a turn of silence."""
         silent = self._count and now_ns - self._last_ns > self._period_ns
         if silent or self._count + count > MAX_SAMPLES:
             self.clear()
@@ -146,16 +143,16 @@ class TurnBuffer(abc.ABC, Generic[Piece]):
         self._count += count
 
     def finish(self, now_ns: int) -> LaserScan | None:
-        """Return the scan of the turn that ends here; a new one begins.
+        """Return the scan of the turn that ends now, and begin a new turn.
 
-        None when its start was not seen, and when its bytes came faster or slower than a lidar
-        turns: a process that was held up gets what waited in the port at once, and that is old.
+        Return None if the start of the turn was not seen, or its bytes arrived faster or slower
+        than a lidar turns. After a delay of the process, old bytes arrive from the port at once.
         """
-        pieces, count, whole = self._pieces, self._count, self._whole
-        took = (now_ns - self._began_ns) / self._period_ns
+        pieces, count, start_seen = self._pieces, self._count, self._start_seen
+        periods = (now_ns - self._began_ns) / self._period_ns
         self.clear()
-        self._whole = True
-        if not count or not whole or not MIN_PERIODS <= took <= MAX_PERIODS:
+        self._start_seen = True
+        if not count or not start_seen or not MIN_PERIODS <= periods <= MAX_PERIODS:
             return None
         angles, distances = self.unpack(pieces)
         ranges = np.where(distances == 0.0, np.inf, distances / 1000)
@@ -163,12 +160,12 @@ class TurnBuffer(abc.ABC, Generic[Piece]):
 
 
 class SampleBuffer(TurnBuffer[tuple[Sequence[float], Sequence[float]]]):
-    """A turn of samples as numbers: angles [deg] clockwise, and distances [mm]."""
+    """Collects a turn as sequences of angles [deg] clockwise, and distances [mm]."""
 
     def unpack(
         self, pieces: list[tuple[Sequence[float], Sequence[float]]]
     ) -> tuple[Samples, Samples]:
-        """Join the pieces one after the other."""
+        """Join the pieces in order."""
         angles, distances = map(itertools.chain.from_iterable, zip(*pieces, strict=True))
         return np.fromiter(angles, np.float64), np.fromiter(distances, np.float64)
 
@@ -179,10 +176,10 @@ class SampleBuffer(TurnBuffer[tuple[Sequence[float], Sequence[float]]]):
         turn_at: int | None,
         now_ns: int,
     ) -> LaserScan | None:
-        """Add samples (n,) of a lidar that turns clockwise and sends 0 mm for no return.
+        """Add samples (n,) of a lidar that turns clockwise; 0 mm means no return.
 
-        `turn_at` is the index of the first that belongs to a new turn; the scan of the turn that
-        ends there is returned.
+        `turn_at` is the index of the first sample of a new turn, if one begins. Then the scan of
+        the ended turn is returned.
         """
         if turn_at is None:
             self.add((angles_deg, distances_mm), len(angles_deg), now_ns)
@@ -196,17 +193,17 @@ class SampleBuffer(TurnBuffer[tuple[Sequence[float], Sequence[float]]]):
 
 
 def bin_scan(lidar: Lidar, angles: ArrayLike, ranges: ArrayLike) -> LaserScan:
-    """Return one scan of samples (n,) at `angles` [rad] with `ranges` [m], inf for no return.
+    """Return one scan of samples (n,) at `angles` [rad] with `ranges` [m]; inf means no return.
 
-    Of samples that share a bin the nearest counts. Beyond `range_max` counts as no return; nearer
-    than `range_min`, as in the simulation, as being at `range_min`, which is never free space.
+    The nearest sample in a bin counts. A range above `range_max` counts as no return. A range
+    below `range_min` becomes `range_min`, as in the simulation, because it is not free space.
     """
     increment = math.tau / lidar.beams
     index = np.rint(np.asarray(angles) / increment).astype(np.intp) % lidar.beams
     values = np.maximum(np.asarray(ranges, np.float64), lidar.range_min)
     values[values > lidar.range_max] = np.inf
     bins = np.full(lidar.beams, np.nan)
-    np.fmin.at(bins, index, values)  # fmin: a measured value wins over nan
+    np.fmin.at(bins, index, values)  # fmin ignores nan
     return LaserScan(
         angle_min=0.0,
         angle_increment=increment,

@@ -1,4 +1,4 @@
-"""Lidars on a serial port: what they share, whatever their protocol."""
+"""Base class of lidars on a serial port."""
 
 import abc
 import asyncio
@@ -22,16 +22,16 @@ _LDS01 = re.compile(rb"\xfa[\xa0-\xdb].{40}\xfa[\xa0-\xdb]", re.DOTALL)
 _COIN_D4 = re.compile(rb"\xaa\x55.{8}", re.DOTALL)
 
 CHECK_PERIOD_NS = 100_000_000  # between two checks for scans
-LOG_AFTER_NS = 2_000_000_000  # without a scan, until it is logged
-REOPEN_NS = 5_000_000_000  # without a scan, until the port is reopened
-GATHER_S = 0.01  # a turn takes ten times as long; its bytes come hundreds of times a second
-GATHER_BAUD = 460_800  # what comes faster fills the 4 KB of a port too soon
-FLUSH_S = 0.02
-KEPT_BYTES = 256  # bytes, kept to say what else may be sending there
+LOG_AFTER_NS = 2_000_000_000  # missing scans are logged after this time
+REOPEN_NS = 5_000_000_000  # the port is reopened after this time without a scan
+GATHER_S = 0.01  # bytes within this time are read together; a turn takes ten times as long
+MAX_GATHER_BAUD = 460_800  # at a higher rate, the port's buffer of 4 KB is full too soon
+FLUSH_S = 0.02  # for the stop command, before the port is closed
+MAX_KEPT_BYTES = 256  # newest bytes, from which another lidar is identified
 
 
 def identify_lidar(data: bytes) -> str:
-    """Return the known lidar that sends such bytes, or an empty text."""
+    """Return the name of a known lidar that sends such bytes, or an empty text."""
     if ld.LdDecoder().feed(data):
         return "an LDROBOT lidar (ld06, ld19, lds02)"
     if _LDS01.search(data):
@@ -44,21 +44,21 @@ def identify_lidar(data: bytes) -> str:
 
 
 class StreamDecoder(Protocol):
-    """A decoder of what comes from a lidar."""
+    """A decoder of a lidar's bytes."""
 
-    errors: int  # how often something was thrown away
+    errors: int  # number of times that bytes were dropped
 
     def clear(self) -> None:
-        """Forget what has begun to come in."""
+        """Drop partial data."""
 
 
 class SerialSource(ScanSource):
-    """Keeps its port open. Logs once why there are no scans, and once that they come again.
+    """Keeps its port open. Logs once why there are no scans, and once that they are back.
 
-    A subclass sets `understood` when what came since the port was opened makes sense.
+    A subclass sets `understood` when it receives valid data; opening the port clears it.
     """
 
-    name: ClassVar[str]  # as people call it
+    name: ClassVar[str]  # in texts for users
 
     def __init__(
         self, options: Any, lidar: Lidar, clock: Clock, baud: int, decoder: StreamDecoder
@@ -80,11 +80,11 @@ class SerialSource(ScanSource):
 
     @abc.abstractmethod
     def connected(self) -> None:
-        """Prepare for a newly opened port: nothing from before counts."""
+        """Reset all state for a newly opened port."""
 
     @abc.abstractmethod
     def probe(self, port: serial.Serial) -> bool:
-        """Return whether the right lidar is on this port. In a thread; may raise OSError."""
+        """Return whether the right lidar is on this port. Runs in a thread; may raise OSError."""
 
     def open(self) -> None:
         """Connect in the background."""
@@ -95,19 +95,19 @@ class SerialSource(ScanSource):
             self._task = asyncio.create_task(self.run(), name=self.name)
 
     async def close(self) -> None:
-        """Bring the lidar to rest and free the port."""
+        """Stop the lidar and free the port."""
         task, self._task = self._task, None
         if task:
             task.cancel()
             with contextlib.suppress(asyncio.CancelledError):
                 await task
         if self.link.connected and self.send_stop():
-            await asyncio.sleep(FLUSH_S)  # closing throws away what is not sent by then
+            await asyncio.sleep(FLUSH_S)  # closing drops unsent bytes
         await self.link.close()
 
     @property
     def health(self) -> LinkHealth:
-        """The line's state; connected means that scans come."""
+        """The line's state; `connected` means that scans arrive."""
         line = self.link.health
         return LinkHealth(
             connected=line.connected and not self.problem,
@@ -118,7 +118,7 @@ class SerialSource(ScanSource):
 
     @property
     def problem(self) -> str:
-        """The reason why there are no scans; empty while they come, and for 2 s without."""
+        """The reason why there are no scans; empty for the first 2 s without a scan."""
         return self._problem
 
     async def run(self) -> None:
@@ -130,7 +130,7 @@ class SerialSource(ScanSource):
                 self.link.drop(self._problem)
 
     def watch_scans(self, now_ns: int) -> None:
-        """Find out why there are no scans, and log it when that has changed."""
+        """Update `problem`, and log it if it changes."""
         before = self._problem
         self._problem = ""
         if now_ns - self._scan_ns > LOG_AFTER_NS:
@@ -141,17 +141,17 @@ class SerialSource(ScanSource):
             log.info("%s: scans are back", self.name)
 
     def explain(self) -> str:
-        """Return why there are no scans though the port is open."""
+        """Return why there are no scans although the port is open."""
         if not self.understood:
             return self.explain_silence()
         return f"the {self.name} on {self.link} answers, but does not turn"
 
     def send_stop(self) -> bool:
-        """Send the lidar to rest before its port is closed; return whether bytes were sent."""
+        """Stop the lidar before its port is closed; return whether bytes were sent."""
         return False
 
     def explain_silence(self) -> str:
-        """Return what may be wrong where bytes make no sense, or none come at all."""
+        """Return the possible reasons for invalid bytes, or no bytes at all."""
         where = f"{self.link} at {self.baud} baud"
         if not self._newest:
             return f"no data comes from {where}: is the {self.name} powered, and wired both ways?"
@@ -164,20 +164,20 @@ class SerialSource(ScanSource):
         return identify_lidar(self._newest)
 
     def emit_scan(self, scan: LaserScan | None) -> None:
-        """Emit the scan of a turn that has ended, if it is one."""
+        """Emit the scan of an ended turn, if there is one."""
         if scan:
             self._scan_ns = self.clock.now_ns()
             self.emit(scan)
 
     def _on_open(self) -> None:
         self._opened_ns = self.clock.now_ns()
-        self.link.gather_s = GATHER_S if self.link.baud <= GATHER_BAUD else 0.0
+        self.link.gather_s = GATHER_S if self.link.baud <= MAX_GATHER_BAUD else 0.0
         self._newest, self.understood = b"", False
         self._stream.clear()
         self.turn.clear()
         self.connected()
 
     def _on_bytes(self, data: bytes) -> None:
-        self._newest = (self._newest + data)[-KEPT_BYTES:]
+        self._newest = (self._newest + data)[-MAX_KEPT_BYTES:]
         self.received(data)
         self.link.errors = self._stream.errors

@@ -35,11 +35,11 @@ def frames(draw: st.DrawFn) -> ld.LdFrame:
 any_frame = st.composite(frames)()
 
 
-def test_crc8_of_the_bytes_1_2_and_3_is_as_in_the_vendors_table() -> None:
+def test_crc8_matches_the_vendors_table() -> None:
     assert [ld.crc8(bytes([n])) for n in (1, 2, 3)] == [0x4D, 0x9A, 0xD7]
 
 
-def test_the_manuals_frame_decodes_to_the_manuals_numbers() -> None:
+def test_the_frame_in_the_manual_decodes_to_its_numbers() -> None:
     frame = ld.decode(MANUAL)
 
     assert frame is not None
@@ -53,7 +53,7 @@ def test_the_manuals_frame_decodes_to_the_manuals_numbers() -> None:
     assert ld.encode(frame) == MANUAL
 
 
-def test_a_frame_of_a_real_lidar_that_saw_nothing_decodes() -> None:
+def test_a_captured_frame_without_returns_decodes() -> None:
     frame = ld.decode(CAPTURED)
 
     assert frame is not None
@@ -62,7 +62,7 @@ def test_a_frame_of_a_real_lidar_that_saw_nothing_decodes() -> None:
     assert frame.confidences == (212, 212, 212, 212, 212, 213, 213, 73, 95, 176, 210, 212)
 
 
-def test_angles_go_on_through_a_full_turn() -> None:
+def test_angles_continue_above_360_degrees() -> None:
     frame = ld.LdFrame(3600, 35_800, 13, (0,) * 12, (0,) * 12, 0)
 
     assert frame.angles()[0] == 358.0
@@ -70,12 +70,12 @@ def test_angles_go_on_through_a_full_turn() -> None:
 
 
 @given(any_frame)
-def test_every_frame_comes_back_as_it_was(frame: ld.LdFrame) -> None:
+def test_frame_round_trip(frame: ld.LdFrame) -> None:
     assert ld.LdDecoder().feed(ld.encode(frame)) == [frame]
 
 
 @pytest.mark.parametrize("good", [MANUAL, CAPTURED])
-def test_no_flip_of_one_bit_and_no_burst_within_a_byte_is_accepted(good: bytes) -> None:
+def test_a_frame_with_one_damaged_byte_is_refused(good: bytes) -> None:
     for at in range(47):
         for pattern in range(1, 256):
             damaged = bytearray(good)
@@ -84,7 +84,7 @@ def test_no_flip_of_one_bit_and_no_burst_within_a_byte_is_accepted(good: bytes) 
 
 
 @given(any_frame, st.integers(0, 47 * 8 - 1))
-def test_no_flip_of_one_bit_in_any_frame_is_accepted(frame: ld.LdFrame, bit: int) -> None:
+def test_any_frame_with_one_flipped_bit_is_refused(frame: ld.LdFrame, bit: int) -> None:
     damaged = bytearray(ld.encode(frame))
     damaged[bit // 8] ^= 1 << bit % 8
 
@@ -92,7 +92,7 @@ def test_no_flip_of_one_bit_in_any_frame_is_accepted(frame: ld.LdFrame, bit: int
 
 
 @given(any_frame, st.sets(st.integers(0, 47 * 8 - 1), min_size=2, max_size=2))
-def test_two_flipped_bits_pass_only_where_the_crc_repeats_255_bits_apart(
+def test_two_flipped_bits_are_accepted_only_if_they_are_255_bits_apart(
     frame: ld.LdFrame, bits: set[int]
 ) -> None:
     damaged = bytearray(ld.encode(frame))
@@ -107,11 +107,11 @@ def test_two_flipped_bits_pass_only_where_the_crc_repeats_255_bits_apart(
     [
         ("start", 36_000),  # beyond a turn
         ("end", 36_000),
-        ("end", 32_427 - 1),  # the whole turn but a hundredth within one frame
-        ("speed", 0),  # points spread by a lidar that does not turn
+        ("end", 32_427 - 1),  # almost a full turn in one frame
+        ("speed", 0),  # different angles without rotation
     ],
 )
-def test_a_frame_that_no_lidar_can_mean_is_refused_though_its_crc_is_right(
+def test_a_frame_with_impossible_values_is_refused_although_its_crc_is_right(
     field: str, value: int
 ) -> None:
     frame = ld.decode(MANUAL)
@@ -122,7 +122,7 @@ def test_a_frame_that_no_lidar_can_mean_is_refused_though_its_crc_is_right(
 
 @pytest.mark.long
 @given(st.lists(st.sampled_from([MANUAL, CAPTURED]), max_size=6), st.data())
-def test_it_does_not_matter_how_the_bytes_are_cut(parts: list[bytes], data: st.DataObject) -> None:
+def test_frames_are_found_in_pieces_of_any_size(parts: list[bytes], data: st.DataObject) -> None:
     stream, decoder, found = b"".join(parts), ld.LdDecoder(), []
     while stream:
         size = data.draw(st.integers(1, len(stream)))
@@ -134,22 +134,22 @@ def test_it_does_not_matter_how_the_bytes_are_cut(parts: list[bytes], data: st.D
 
 
 @given(st.binary(max_size=300))
-def test_a_frame_after_any_garbage_is_found_by_the_second_time_it_is_sent(garbage: bytes) -> None:
+def test_the_second_frame_after_any_noise_is_found_at_the_latest(noise: bytes) -> None:
     decoder = ld.LdDecoder()
-    decoder.feed(garbage)
+    decoder.feed(noise)
 
     assert ld.decode(MANUAL) in decoder.feed(MANUAL + MANUAL)
 
 
 @given(st.lists(st.binary(max_size=100), max_size=50))
-def test_what_is_kept_between_calls_stays_below_one_frame(pieces: list[bytes]) -> None:
+def test_the_decoder_keeps_less_than_one_frame(pieces: list[bytes]) -> None:
     decoder = ld.LdDecoder()
     for piece in pieces:
         decoder.feed(piece)
         assert len(decoder._buffer) < 47
 
 
-def test_joining_a_stream_half_way_is_no_error_but_losing_step_is() -> None:
+def test_bytes_before_the_first_frame_are_no_error_but_later_ones_are() -> None:
     decoder = ld.LdDecoder()
 
     assert len(decoder.feed(MANUAL[20:] + MANUAL)) == 1
@@ -158,24 +158,24 @@ def test_joining_a_stream_half_way_is_no_error_but_losing_step_is() -> None:
     assert decoder.errors == 2  # the stray byte, and the half frame
 
 
-def test_a_lidar_that_sends_ec_in_place_of_2c_is_understood() -> None:
+def test_a_lidar_that_sends_ec_instead_of_2c_is_supported() -> None:
     other = bytes([0x54, 0xEC]) + MANUAL[2:46]
 
     assert ld.decode(other + bytes([ld.crc8(other)])) == ld.decode(MANUAL)
 
 
 @pytest.mark.long
-def test_of_frames_with_a_tenth_of_a_percent_of_bytes_wrong_next_to_none_pass_as_others() -> None:
+def test_with_a_tenth_of_a_percent_of_bytes_wrong_almost_no_frame_is_decoded_wrong() -> None:
     chance = random.Random(3)
-    decoder, sent, wrong, whole = ld.LdDecoder(), ld.decode(MANUAL), 0, 0
+    decoder, sent, wrong, right = ld.LdDecoder(), ld.decode(MANUAL), 0, 0
     for _ in range(50):
         stream = bytearray(MANUAL * 400)
         for at in range(len(stream)):
             if chance.random() < 0.001:
                 stream[at] ^= chance.randrange(1, 256)
         for frame in decoder.feed(bytes(stream)):
-            whole += frame == sent
+            right += frame == sent
             wrong += frame != sent
 
-    assert wrong <= 3  # 7e-6 of all pass: 0.14 of these 20 000
-    assert 18_900 <= whole <= 19_250  # of 20 000; (1 - 0.001)^47 = 95.4 %
+    assert wrong <= 3  # 7e-6 of all frames: 0.14 of these 20 000
+    assert 18_900 <= right <= 19_250  # of 20 000; (1 - 0.001)^47 = 95.4 %

@@ -1,4 +1,4 @@
-"""The lidars of TurtleBot3, LDS-01 and LDS-03: frames, joints of the stream, noise."""
+"""The protocols of LDS-01 and LDS-03, the lidars of TurtleBot3: packets, cut streams, noise."""
 
 from hypothesis import given
 from hypothesis import strategies as st
@@ -35,8 +35,8 @@ def turn01(begin: int = 0, count: int = 60) -> list[lds01.Lds01Packet]:
     ]
 
 
-def test_an_lds01_packet_is_six_degrees_of_the_turn() -> None:
-    first = bytes.fromhex(LDS01) + b"??"  # the rule of its checksum is not known
+def test_an_lds01_packet_has_six_samples() -> None:
+    first = bytes.fromhex(LDS01) + b"??"  # its checksum is not documented
     decoder = lds01.Lds01Decoder()
     assert decoder.feed(first) == []
     assert decoder.feed(b"\xfa\xa1") == [
@@ -45,12 +45,12 @@ def test_an_lds01_packet_is_six_degrees_of_the_turn() -> None:
     assert decoder.errors == 0
 
 
-def test_lds01_is_started_and_stopped_by_a_letter() -> None:
+def test_lds01_commands_are_letters() -> None:
     assert (lds01.START, lds01.STOP) == (b"b", b"e")
 
 
 @given(packets01)
-def test_lds01_packets_survive_the_wire(packet: lds01.Lds01Packet) -> None:
+def test_lds01_packet_round_trip(packet: lds01.Lds01Packet) -> None:
     following = bytes([0xFA, 0xA0 + (packet.number + 1) % 60])
     assert lds01.Lds01Decoder().feed(lds01.encode(packet) + following) == [packet]
 
@@ -67,7 +67,7 @@ def test_lds01_packets_are_found_in_pieces_of_any_size(begin: int, size: int) ->
 
 
 @given(st.binary(max_size=300))
-def test_lds01_finds_its_step_again_behind_any_noise(noise: bytes) -> None:
+def test_lds01_packets_are_found_after_any_noise(noise: bytes) -> None:
     sent = turn01(5, 20)
     decoder = lds01.Lds01Decoder()
     decoder.feed(noise)
@@ -75,7 +75,7 @@ def test_lds01_finds_its_step_again_behind_any_noise(noise: bytes) -> None:
     assert found[-17:] == sent[2:-1]
 
 
-def test_an_lds01_packet_with_bytes_missing_is_thrown_away() -> None:
+def test_an_lds01_packet_with_missing_bytes_is_dropped() -> None:
     frames = [lds01.encode(packet) for packet in turn01(0, 4)]
     frames[1] = frames[1][:-3]
     decoder = lds01.Lds01Decoder()
@@ -83,7 +83,7 @@ def test_an_lds01_packet_with_bytes_missing_is_thrown_away() -> None:
     assert decoder.errors == 1
 
 
-def test_noise_takes_no_room_in_any_lidars_decoder() -> None:
+def test_noise_does_not_fill_the_decoders() -> None:
     one, three = lds01.Lds01Decoder(), lds03.Lds03Decoder()
     for _ in range(20):
         one.feed(b"\xfa\xa0" * 2000)
@@ -92,13 +92,13 @@ def test_noise_takes_no_room_in_any_lidars_decoder() -> None:
     assert len(three._buffer) < 800
 
 
-def test_lds03_commands_are_the_vendors() -> None:
+def test_lds03_commands_are_those_of_the_vendor() -> None:
     assert lds03.START.hex(" ") == "aa 55 f0 0f"
     assert lds03.STOP.hex(" ") == "aa 55 f5 0a"
     assert lds03.command(0xFC).hex(" ") == "aa 55 fc 03"
 
 
-def test_an_lds03_packet_says_its_angles_itself() -> None:
+def test_an_lds03_packet_has_its_angles() -> None:
     decoder = lds03.Lds03Decoder()
     expected = lds03.Lds03Packet(
         begins=True,
@@ -112,7 +112,7 @@ def test_an_lds03_packet_says_its_angles_itself() -> None:
     assert lds03.encode(expected).hex(" ") == LDS03
 
 
-def test_lds03_angles_go_on_across_zero() -> None:
+def test_lds03_angles_wrap_at_zero() -> None:
     two = (lds03.Lds03Sample(359.0, 500, 50, False), lds03.Lds03Sample(1.0, 500, 50, False))
     three = (two[0], lds03.Lds03Sample(0.0, 500, 50, False), two[1])
     (packet,) = lds03.Lds03Decoder().feed(lds03.encode(lds03.Lds03Packet(False, 0.0, three)))
@@ -120,13 +120,13 @@ def test_lds03_angles_go_on_across_zero() -> None:
 
 
 @given(st.lists(samples03, min_size=1, max_size=255), st.booleans())
-def test_lds03_samples_survive_the_wire(many: list[lds03.Lds03Sample], begins: bool) -> None:
+def test_lds03_samples_round_trip(many: list[lds03.Lds03Sample], begins: bool) -> None:
     packet = lds03.Lds03Packet(begins, 10.0 if begins else 0.0, tuple(many))
     assert lds03.Lds03Decoder().feed(lds03.encode(packet)) == [packet]
 
 
 @given(st.binary(max_size=200), st.integers(1, 30))
-def test_lds03_finds_its_step_again_behind_any_noise(noise: bytes, size: int) -> None:
+def test_lds03_packets_are_found_after_any_noise(noise: bytes, size: int) -> None:
     packet = lds03.Lds03Packet(True, 10.0, (lds03.Lds03Sample(0.0, 1234, 56, False),) * 20)
     stream = noise + bytes(1000) + lds03.encode(packet)
     decoder, found = lds03.Lds03Decoder(), []
@@ -135,7 +135,7 @@ def test_lds03_finds_its_step_again_behind_any_noise(noise: bytes, size: int) ->
     assert found[-1:] == [packet]
 
 
-def test_no_single_flipped_bit_passes_for_lds03_samples() -> None:
+def test_lds03_packets_with_one_flipped_bit_are_refused() -> None:
     for bit in range(16 * 8):
         frame = bytearray.fromhex(LDS03)
         frame[bit // 8] ^= 1 << bit % 8

@@ -30,7 +30,7 @@ shifts = st.integers(0, 63)
 
 
 @pytest.mark.parametrize(
-    ("made", "expected"),
+    ("encoded", "expected"),
     [
         (rplidar.request(rplidar.STOP), "a5 25"),
         (rplidar.request(rplidar.GET_INFO), "a5 50"),
@@ -46,17 +46,17 @@ shifts = st.integers(0, 63)
         (encode_node(10.0, 2000.0, quality=15, begins=True), "3d 01 05 40 1f"),
     ],
 )
-def test_bytes_are_those_of_the_vendors_document(made: bytes, expected: str) -> None:
-    assert made == bytes.fromhex(expected)
+def test_bytes_match_the_vendors_document(encoded: bytes, expected: str) -> None:
+    assert encoded == bytes.fromhex(expected)
 
 
-def test_the_documents_node_is_a_sample_at_ten_degrees_and_two_metres_that_begins_a_turn() -> None:
+def test_the_node_in_the_document_decodes_to_its_numbers() -> None:
     assert RplidarDecoder().feed(STANDARD + bytes.fromhex("3d0105401f")) == [
         Samples((10.0,), (2000.0,), 0)
     ]
 
 
-def test_info_and_health_come_back_as_they_were_and_as_other_clients_read_them() -> None:
+def test_info_and_health_round_trip_and_match_pyrplidar() -> None:
     health = rplidar.Health(1, 0x0102)
     wire = rplidar.answer(rplidar.INFO, INFO.pack()) + rplidar.answer(rplidar.HEALTH, health.pack())
     first, second = RplidarDecoder().feed(wire)
@@ -70,7 +70,7 @@ def test_info_and_health_come_back_as_they_were_and_as_other_clients_read_them()
 
 
 @given(st.integers(0, 0xFF), st.binary(max_size=32))
-def test_requests_arrive_as_they_were_sent_whatever_their_pieces(command: int, data: bytes) -> None:
+def test_requests_are_found_in_single_bytes(command: int, data: bytes) -> None:
     payload = data if command >= 0x80 else b""
     decoder = RequestDecoder()
     wire = b"\x00garbage" + rplidar.request(command, payload)
@@ -79,7 +79,7 @@ def test_requests_arrive_as_they_were_sent_whatever_their_pieces(command: int, d
     assert found == [Request(command, payload)]
 
 
-def test_a_request_with_a_wrong_checksum_is_dropped_and_the_next_is_found() -> None:
+def test_a_request_with_a_wrong_checksum_is_dropped_and_the_next_one_is_found() -> None:
     bad = bytearray(rplidar.express_request())
     bad[3] ^= 1
     decoder = RequestDecoder()
@@ -89,7 +89,7 @@ def test_a_request_with_a_wrong_checksum_is_dropped_and_the_next_is_found() -> N
 
 
 @given(st.floats(0, 359.9), distances, st.booleans(), st.integers(0, 63))
-def test_both_other_clients_read_our_standard_nodes_as_we_do(
+def test_standard_nodes_decode_as_in_two_other_clients(
     angle: float, distance: float, begins: bool, quality: int
 ) -> None:
     wire = encode_node(angle, distance, quality=quality, begins=begins)
@@ -106,7 +106,7 @@ def test_both_other_clients_read_our_standard_nodes_as_we_do(
     st.floats(0.5, 60),
     st.lists(st.tuples(distances, shifts), min_size=32, max_size=32),
 )
-def test_pyrplidar_reads_our_express_capsules_as_we_do(
+def test_express_capsules_decode_as_in_pyrplidar(
     start: float, width: float, points: list[tuple[int, int]]
 ) -> None:
     mm, q3 = [p[0] for p in points], [p[1] for p in points]
@@ -124,8 +124,8 @@ def test_pyrplidar_reads_our_express_capsules_as_we_do(
         assert abs((angle - other.get_angle() + 180) % 360 - 180) < 0.05
 
 
-def test_rplidar_roboticia_reads_express_one_sample_late_and_otherwise_as_we_do() -> None:
-    """Its known fault: the angle of the next sample. Allowed for by shifting by one."""
+def test_express_capsules_decode_as_in_rplidar_roboticia_but_for_its_shifted_angles() -> None:
+    """rplidar-roboticia returns the angle of the next sample: a known fault, shifted back here."""
     mm = list(range(1000, 1320, 10))
     first, second = (encode_express(s, mm, begins=False) for s in (40.0, 72.0))
     express = Express()
@@ -144,7 +144,7 @@ def test_rplidar_roboticia_reads_express_one_sample_late_and_otherwise_as_we_do(
     st.floats(0.5, 60),
     st.lists(st.integers(0, 0xFFFF), min_size=40, max_size=40),
 )
-def test_pyrplidar_reads_our_dense_capsules_as_we_do_but_for_its_swapped_bytes(
+def test_dense_capsules_decode_as_in_pyrplidar_but_for_its_swapped_bytes(
     start: float, width: float, mm: list[int]
 ) -> None:
     first = encode_dense(start, mm, begins=True)

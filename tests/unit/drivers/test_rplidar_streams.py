@@ -1,4 +1,4 @@
-"""Streams of an RPLIDAR: cut, damaged, and with bytes lost."""
+"""Streams of an RPLIDAR: in pieces, damaged, and with lost bytes."""
 
 import random
 
@@ -16,7 +16,7 @@ INFO = Info(0x18, (1, 29), 7, "0123456789ABCDEF" * 2)
 
 
 def dense_turns(turns: int) -> bytes:
-    """A lidar of 360 samples a turn: nine capsules of 40 degrees, 1 m at 0 deg to 4.59 m at 359."""
+    """Return a stream with 360 samples per turn, from 1 m at 0 deg to 4.59 m at 359 deg."""
     capsules = [[1000 + 10 * (k * 40 + n) for n in range(40)] for k in range(9)]
     return b"".join(
         encode_dense(40.0 * k, capsules[k], begins=turn + k == 0)
@@ -35,7 +35,7 @@ def samples(found: list[Answer | Samples]) -> list[tuple[float, float]]:
 
 @pytest.mark.long
 @given(st.data())
-def test_a_dense_stream_decodes_the_same_however_it_is_cut(data: st.DataObject) -> None:
+def test_a_dense_stream_decodes_in_pieces_of_any_size(data: st.DataObject) -> None:
     stream, decoder, found = DENSE + dense_turns(2), RplidarDecoder(), list[Answer | Samples]()
     while stream:
         size = data.draw(st.integers(1, 400))
@@ -48,7 +48,7 @@ def test_a_dense_stream_decodes_the_same_however_it_is_cut(data: st.DataObject) 
     assert decoder.errors == 0
 
 
-def test_a_turn_begins_at_the_sample_that_passes_zero() -> None:
+def test_a_turn_begins_at_the_first_sample_after_zero() -> None:
     dense = Dense()
     mm = [1000] * 40
     dense.decode(encode_dense(350.0, mm, begins=False))
@@ -62,7 +62,7 @@ def test_a_turn_begins_at_the_sample_that_passes_zero() -> None:
 
 
 @pytest.mark.parametrize("lost", [84, 83, 1])
-def test_bytes_lost_from_a_dense_stream_never_bend_an_angle(lost: int) -> None:
+def test_bytes_lost_from_a_dense_stream_never_falsify_an_angle(lost: int) -> None:
     stream = DENSE + dense_turns(3)
     cut = len(DENSE) + 84 * 12 + 10
     points = samples(RplidarDecoder().feed(stream[:cut] + stream[cut + lost :]))
@@ -71,7 +71,7 @@ def test_bytes_lost_from_a_dense_stream_never_bend_an_angle(lost: int) -> None:
     assert len(points) >= 40 * 26 - 40 * 5
 
 
-def test_a_lost_capsule_is_noticed_though_every_checksum_is_right() -> None:
+def test_a_lost_capsule_is_noticed_although_all_checksums_are_right() -> None:
     stream = DENSE + dense_turns(2)
     cut = len(DENSE) + 84 * 5
     decoder = RplidarDecoder()
@@ -89,29 +89,29 @@ def standard_turns(turns: int) -> bytes:
 
 
 @given(st.integers(40, 1700), st.integers(1, 60))
-def test_a_standard_stream_finds_its_step_again_after_lost_bytes(at: int, lost: int) -> None:
+def test_a_standard_stream_is_in_step_again_after_lost_bytes(at: int, lost: int) -> None:
     stream = standard_turns(2)
     decoder = RplidarDecoder()
     points = samples(decoder.feed(STANDARD + stream[:at] + stream[at + lost :]))
 
     assert all(distance == 1000 + 10 * angle for angle, distance in points[: at // 5])
     wrong = sum(distance != 1000 + 10 * angle for angle, distance in points)
-    assert wrong <= 2  # the node that was cut has no checksum: it may pass
+    assert wrong <= 2  # the cut node may be accepted, as it has no checksum
     assert len(points) >= 700 - lost // 5
 
 
-def test_a_turn_is_seen_to_end_though_the_node_that_says_so_was_lost() -> None:
+def test_a_turn_ends_although_the_first_node_of_the_next_one_was_lost() -> None:
     stream = standard_turns(3)
     found = RplidarDecoder().feed(STANDARD + stream[: 360 * 5] + stream[361 * 5 :])
     begins = [n for n, item in enumerate(found) if isinstance(item, Samples) and item.turn_at == 0]
 
-    assert begins == [0, 400, 719]  # 400 degrees on, where it was lost
+    assert begins == [0, 400, 719]  # after 400 degrees in the turn without a first node
 
 
 @given(st.binary(max_size=200))
-def test_a_descriptor_is_found_after_any_garbage(garbage: bytes) -> None:
+def test_a_descriptor_is_found_after_any_noise(noise: bytes) -> None:
     decoder = RplidarDecoder()
-    decoder.feed(garbage)
+    decoder.feed(noise)
     decoder.clear()
 
     assert decoder.feed(b"RP LIDAR System.\r\n" + rplidar.answer(rplidar.INFO, INFO.pack())) == [
@@ -120,7 +120,7 @@ def test_a_descriptor_is_found_after_any_garbage(garbage: bytes) -> None:
 
 
 @given(st.lists(st.binary(max_size=100), max_size=40), st.sampled_from([b"", STANDARD, DENSE]))
-def test_what_the_decoders_keep_is_bounded_and_nothing_raises(
+def test_decoders_keep_a_bounded_number_of_bytes_and_never_raise(
     pieces: list[bytes], first: bytes
 ) -> None:
     decoder, requests = RplidarDecoder(), RequestDecoder()
@@ -132,7 +132,7 @@ def test_what_the_decoders_keep_is_bounded_and_nothing_raises(
         assert len(requests._buffer) < 260
 
 
-def test_no_single_wrong_byte_in_a_capsule_is_accepted() -> None:
+def test_a_capsule_with_one_wrong_byte_is_refused() -> None:
     good = encode_dense(40.0, range(1000, 1400, 10), begins=False)
     for at in range(84):
         for pattern in (1, 0x80, 0x55, 0xFF):
@@ -142,7 +142,7 @@ def test_no_single_wrong_byte_in_a_capsule_is_accepted() -> None:
 
 
 @pytest.mark.long
-def test_a_tenth_of_a_percent_of_wrong_bytes_bends_next_to_no_dense_sample() -> None:
+def test_with_a_tenth_of_a_percent_of_bytes_wrong_almost_no_dense_sample_is_decoded_wrong() -> None:
     chance = random.Random(5)
     stream = bytearray(dense_turns(400))
     for at in range(len(stream)):
@@ -152,4 +152,4 @@ def test_a_tenth_of_a_percent_of_wrong_bytes_bends_next_to_no_dense_sample() -> 
     wrong = sum(abs(distance - 1000 - 10 * (angle % 360)) > 1 for angle, distance in points)
 
     assert len(points) > 0.8 * 144_000
-    assert wrong <= 80  # two capsules; a capsule passes with two errors that cancel in its XOR
+    assert wrong <= 80  # two capsules; two errors that cancel in the XOR are not noticed

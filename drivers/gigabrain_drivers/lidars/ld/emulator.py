@@ -1,4 +1,4 @@
-"""Emulated LDROBOT lidars: they turn and send from power-on, and have no input."""
+"""Emulated LDROBOT lidars. They turn and send from power-on, and have no input."""
 
 import math
 from collections import deque
@@ -8,15 +8,15 @@ from gigabrain_drivers.driver.robot import ScanOptions
 from gigabrain_drivers.emulators.base import Device, EmulatedBody, Sample, Sweep, Wire
 from gigabrain_drivers.lidars.ld import protocol as ld
 
-MAX_SAG_VOLTS = 0.5  # below its 5 V by more than this, the motor does not keep its speed
-LENS_X, LENS_Y, SLANT = 5.9, -20.14, 0.11923  # [mm], [mm], of LDS-02's beam beside the axis
-RAYS_PER_SAMPLE = 4  # rays for each of its samples
-RAY_DELAY_DEG = 3.0  # [deg] behind the newest ray, as the beam's slant needs rays on both sides
-MAX_RAYS = 60  # rays, 23 degrees
+MAX_SAG_VOLTS = 0.5  # below 5 V; with a larger sag, the motor does not keep its speed
+LENS_X, LENS_Y, SLANT = 5.9, -20.14, 0.11923  # [mm], [mm], slope; LDS-02's beam misses the axis
+RAYS_PER_SAMPLE = 4  # of LDS-02
+RAY_DELAY_DEG = 3.0  # samples are behind the newest ray: the beam's slope needs rays on both sides
+MAX_RAYS = 60  # newest rays, 23 degrees
 
 
 class LdDevice(Device):
-    """LD06 and LD19. A subclass is another model that sends the same frame."""
+    """LD06 and LD19. Subclasses are other models that send the same frame."""
 
     Options = ScanOptions
     baud: ClassVar[int | None] = 230_400
@@ -29,7 +29,7 @@ class LdDevice(Device):
         self._turn_hz = body.robot.lidar.rate_hz if body.robot.lidar else 10.0
 
     def feed(self, data: bytes) -> None:
-        """Ignore bytes: it has no input."""
+        """Ignore all bytes."""
 
     def reset(self) -> None:
         """Start to turn."""
@@ -42,7 +42,7 @@ class LdDevice(Device):
                 self.wire.write(ld.encode(self._frame([self.measured(s) for s in samples])))
 
     def measured(self, sample: Sample) -> Sample:
-        """Return a sample as this model sends it, before any correction by the host."""
+        """Return a sample as this model sends it, without the host's corrections."""
         return sample
 
     def _frame(self, samples: list[Sample]) -> ld.LdFrame:
@@ -58,7 +58,7 @@ class LdDevice(Device):
 
 
 class Lds02Device(LdDevice):
-    """Sends LD frames of its lens, which is beside the axis and looks across."""
+    """Sends LD frames of its lens, which is not on the axis, and whose beam is slanted."""
 
     baud = 115_200
     samples_hz = 2300
@@ -67,7 +67,7 @@ class Lds02Device(LdDevice):
     def reset(self) -> None:
         """Start to turn."""
         self._rays = deque[Sample](maxlen=MAX_RAYS)
-        self._frame_of: list[Sample] = []
+        self._waiting: list[Sample] = []  # for a complete frame
         self._sweep.start(self.samples_hz * RAYS_PER_SAMPLE, self._turn_hz)
 
     def step(self, now_ns: int) -> None:
@@ -75,23 +75,23 @@ class Lds02Device(LdDevice):
         while rays := self._sweep.next_samples(RAYS_PER_SAMPLE):
             self._rays += rays
             if len(self._rays) == MAX_RAYS:
-                self._frame_of.append(self._by_the_lens((rays[-1].angle - RAY_DELAY_DEG) % 360))
-            if len(self._frame_of) == ld.POINTS:
-                frame, self._frame_of = self._frame(self._frame_of), []
+                self._waiting.append(self._lens_sample((rays[-1].angle - RAY_DELAY_DEG) % 360))
+            if len(self._waiting) == ld.POINTS:
+                frame, self._waiting = self._frame(self._waiting), []
                 if self.sag_volts <= MAX_SAG_VOLTS:
                     self.wire.write(ld.encode(frame))
 
-    def _by_the_lens(self, angle: float) -> Sample:
-        """Return the lens's measurement for the `angle` [deg] that it reports."""
-        distance, seen_at = 0.0, angle
-        for _ in range(4):  # where it looks depends on how far it sees; this settles quickly
+    def _lens_sample(self, angle: float) -> Sample:
+        """Return what the lens measures when it reports `angle` [deg]."""
+        distance, seen_at = 0.0, angle  # from the axis
+        for _ in range(4):  # direction and distance depend on each other; this converges quickly
             distance = self._ray(seen_at).distance
             raw = lens_distance(distance) if distance else 1e6
             seen_at = angle - math.degrees(math.atan2(SLANT * raw + LENS_Y, raw + LENS_X))
         return Sample(angle, lens_distance(distance) if distance else 0.0)
 
     def _ray(self, angle: float) -> Sample:
-        """Return the ray that was cast nearest to `angle` [deg]."""
+        """Return the ray that is nearest to `angle` [deg]."""
         step = 360 * self._turn_hz / self.samples_hz / RAYS_PER_SAMPLE
         back = (self._rays[-1].angle - angle) % 360
         return self._rays[-1 - min(round(back / step), MAX_RAYS - 1)]

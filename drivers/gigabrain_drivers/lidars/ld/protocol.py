@@ -1,7 +1,7 @@
-"""LDROBOT's measurement frame: LD06, LD19, STL-19P, LD14P and LDS-02 (LD08) all send it.
+"""LDROBOT's measurement frame, sent by LD06, LD19, STL-19P, LD14P and LDS-02 (LD08).
 
 47 bytes, little-endian: `54 2C`, speed u16 [deg/s], start u16 [0.01 deg], 12 x {distance u16 [mm],
-confidence u8}, end u16 [0.01 deg], time u16 [ms, wraps at 30000], CRC-8 (poly 0x4D) of all before.
+confidence u8}, end u16 [0.01 deg], time u16 [ms, wraps at 30000], CRC-8 (poly 0x4D) of these bytes.
 Angles run clockwise. Source: LDROBOT's LD06 and LD19 development manuals.
 """
 
@@ -17,10 +17,10 @@ POINTS = 12  # per frame
 SIZE = 47  # bytes
 HEADER, VERSIONS = 0x54, (0x2C, 0xEC)  # low five bits of the second byte: 12 points
 TURN = 36_000  # [0.01 deg]
-CLOCK_MS = 30_000  # where its milliseconds wrap
-MIN_SAMPLES_HZ = 2300  # of the slowest of these lidars; none spreads its points wider
+CLOCK_MS = 30_000  # the lidar's milliseconds wrap here
+MIN_SAMPLES_HZ = 2300  # of the slowest of these lidars, whose points have the widest spacing
 _POINT = np.dtype([("distance", "<u2"), ("confidence", "u1")])
-WIDTH_SLACK = 1.5  # on the width of a frame, as the vendor's driver allows
+WIDTH_SLACK = 1.5  # tolerance factor for the width of a frame, as in the vendor's driver
 _LAYOUT = struct.Struct("<BBHH" + "HB" * POINTS + "HHB")
 _HEAD, _END, _END_AT = struct.Struct("<BBHH"), struct.Struct("<HH"), SIZE - 5
 _FRAMES = np.dtype(
@@ -33,7 +33,7 @@ _CRC = crc_table(0x4D, bits=8)
 
 
 def crc8(data: bytes) -> int:
-    """CRC-8 of `data`: polynomial 0x4D, initially 0, not reflected."""
+    """Return the CRC-8: polynomial 0x4D, initial value 0, not reflected."""
     crc = 0
     for byte in data:
         crc = _CRC[crc ^ byte]
@@ -41,17 +41,17 @@ def crc8(data: bytes) -> int:
 
 
 class LdFrame(NamedTuple):
-    """Twelve measurements in the units of the wire."""
+    """Twelve measurements, in the units of the wire."""
 
     speed: int  # [deg/s]
     start: int  # [0.01 deg], clockwise
     end: int  # [0.01 deg], of the last point
-    distances: tuple[int, ...]  # (12,) [mm], 0 where there was no return
+    distances: tuple[int, ...]  # (12,) [mm], 0 without a return
     confidences: tuple[int, ...]  # (12,), 0-255
     time_ms: int  # wraps at 30000
 
     def angles(self) -> tuple[float, ...]:
-        """The points' angles (12,) [deg], clockwise, from `start` on and so up to 720."""
+        """Return the points' angles (12,) [deg], clockwise; they count up from `start`, to 720."""
         start, step = self.start, (self.end - self.start) % TURN / (POINTS - 1)
         return tuple([(start + n * step) / 100 for n in range(POINTS)])
 
@@ -67,7 +67,7 @@ def encode(frame: LdFrame) -> bytes:
 
 
 class RawFrame(NamedTuple):
-    """A frame's bytes, and where it starts and ends."""
+    """A frame's bytes, with its first and last angle."""
 
     start: int  # [0.01 deg], clockwise
     end: int  # [0.01 deg], of the last point
@@ -75,27 +75,27 @@ class RawFrame(NamedTuple):
     data: bytes  # (47,)
 
 
-def whole(data: bytes) -> RawFrame | None:
-    """Return the frame in exactly 47 bytes, or None when they cannot be one.
+def raw_frame(data: bytes) -> RawFrame | None:
+    """Return the frame in exactly 47 bytes, or None if they are no valid frame.
 
-    CRC-8 lets one in 256 heavily damaged frames through, so what a turning lidar cannot send is
-    refused as well: angles beyond a turn, and points further apart than its speed allows. Of a
-    million frames with 0.1 % of all bytes wrong, 954060 came out right and 4 wrong; with 5 %, of
-    60000 frames 5225 right and 144 wrong. A wrong frame bends twelve samples of one turn.
+    CRC-8 accepts one in 256 heavily damaged frames. So impossible values are refused as well:
+    angles beyond a turn, and points further apart than the speed allows. With 0.1 % of all bytes
+    wrong, of a million frames 954060 were decoded right and 4 wrong. With 5 %, of 60000 frames
+    5225 were decoded right and 144 wrong. A wrong frame falsifies twelve samples of one turn.
     """
-    if crc8(data):  # of all bytes with their own at the end it is 0
+    if crc8(data):  # the CRC over all bytes and their CRC is 0
         return None
     _, version, speed, start = _HEAD.unpack_from(data)
     end, time_ms = _END.unpack_from(data, _END_AT)
-    widest = WIDTH_SLACK * speed * 100 * POINTS / MIN_SAMPLES_HZ
-    if version not in VERSIONS or max(start, end) >= TURN or (end - start) % TURN > widest:
+    max_width = WIDTH_SLACK * speed * 100 * POINTS / MIN_SAMPLES_HZ
+    if version not in VERSIONS or max(start, end) >= TURN or (end - start) % TURN > max_width:
         return None
     return RawFrame(start, end, time_ms, data)
 
 
 def decode(data: bytes) -> LdFrame | None:
-    """Return all fields of the frame in exactly 47 bytes, or None when they cannot be one."""
-    if whole(data) is None:
+    """Return all fields of the frame in exactly 47 bytes, or None if they are no valid frame."""
+    if raw_frame(data) is None:
         return None
     fields = _LAYOUT.unpack(data)
     _, _, speed, start = fields[:4]
@@ -104,10 +104,9 @@ def decode(data: bytes) -> LdFrame | None:
 
 
 def points(frames: bytes) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return all points of whole frames, one after the other.
+    """Return angles (n,) [deg] and distances (n,) [mm] of all points in complete frames.
 
-    Angles (n,) [deg], clockwise, each frame's from its start on and so up to 720, and distances
-    (n,) [mm].
+    Angles are clockwise. In each frame they count up from its start, to 720.
     """
     found = np.frombuffer(frames, _FRAMES)
     start, end = found["start"].astype(np.int64), found["end"].astype(np.int64)
@@ -127,19 +126,19 @@ def describe(frame: LdFrame) -> str:
 
 
 class LdDecoder:
-    """Finds the frames in a stream of bytes, whatever else is in it."""
+    """Finds the frames in a stream of bytes."""
 
     def __init__(self) -> None:
         self._buffer = bytearray()
-        self._in_step = False  # whether the last bytes were a frame; joining half way is no error
-        self.errors = 0  # how often a frame was thrown away
+        self._in_step = False  # True after a frame; bytes before the first frame are no error
+        self.errors = 0  # number of times that bytes were dropped
 
     def feed(self, data: bytes) -> list[LdFrame]:
-        """Return the frames that `data` completes. Fewer than 47 bytes are kept."""
+        """Return the frames that `data` completes. It keeps fewer than 47 bytes."""
         return [frame for raw in self.cut(data) if (frame := decode(raw.data))]
 
     def cut(self, data: bytes) -> list[RawFrame]:
-        """Return the frames that `data` completes as raw bytes, for decoding a turn at once."""
+        """Return the frames that `data` completes as bytes, to decode a turn at once."""
         buffer, frames, at = self._buffer, list[RawFrame](), 0
         buffer += data
         while (found := self._find(at)) >= 0:
@@ -148,7 +147,7 @@ class LdDecoder:
             at = found
             if len(buffer) - at < SIZE:
                 break
-            frame = whole(bytes(buffer[at : at + SIZE]))
+            frame = raw_frame(bytes(buffer[at : at + SIZE]))
             if frame:
                 frames.append(frame)
                 self._in_step = True
@@ -156,7 +155,7 @@ class LdDecoder:
             else:
                 self.errors += 1
                 self._in_step = False
-                at += 2  # the header alone: a whole frame may begin within these 47 bytes
+                at += 2  # skip only the header: a frame may begin within these 47 bytes
         if found < 0:
             if at < len(buffer):
                 self._lose_step()
@@ -165,12 +164,12 @@ class LdDecoder:
         return frames
 
     def clear(self) -> None:
-        """Forget what came so far: what comes next is from another connection."""
+        """Drop partial data, for a new connection."""
         self._buffer.clear()
         self._in_step = False
 
     def _find(self, at: int) -> int:
-        """Return where the next frame may begin, from `at` on; -1 if nowhere."""
+        """Return the index of the next possible frame, from `at` on; -1 if there is none."""
         buffer = self._buffer
         while (at := buffer.find(HEADER, at)) >= 0:
             if at + 1 == len(buffer) or buffer[at + 1] in VERSIONS:

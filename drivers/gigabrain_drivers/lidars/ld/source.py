@@ -1,4 +1,4 @@
-"""LDROBOT's lidars: they turn and send by themselves as soon as they have power."""
+"""Source for LDROBOT lidars. They turn and send without a command."""
 
 import math
 from collections.abc import Callable
@@ -23,25 +23,25 @@ POINTS, WHOLE = np.arange(ld.POINTS), slice(None)
 PROBE_BYTES = 300  # at least five frames
 PROBE_FRAMES = 3
 
-OFFSET_X, OFFSET_Y = 5.9, -20.14  # [mm], of the lens
-SLANT = 0.11923  # of the beam against the reported direction
+OFFSET_X, OFFSET_Y = 5.9, -20.14  # [mm], of the lens from the axis
+SLANT = 0.11923  # slope of the beam against the reported direction
 
 
 class FrameBuffer(TurnBuffer[tuple[bytes, slice]]):
-    """A turn in frames; of the first and of the last one perhaps a part only."""
+    """Collects a turn as frames; of its first and last frame, perhaps only some points."""
 
-    def __init__(self, lidar: Lidar, place: Correction) -> None:
+    def __init__(self, lidar: Lidar, correct: Correction) -> None:
         super().__init__(lidar)
-        self._place = place
+        self._correct = correct
 
     def unpack(self, pieces: list[tuple[bytes, slice]]) -> tuple[Samples, Samples]:
-        """Unpack all frames at once."""
-        angles, distances = self._place(*ld.points(b"".join(raw for raw, _ in pieces)))
+        """Decode all frames at once."""
+        angles, distances = self._correct(*ld.points(b"".join(raw for raw, _ in pieces)))
         kept = np.concatenate([POINTS[part] + n * ld.POINTS for n, (_, part) in enumerate(pieces)])
         return angles[kept], distances[kept]
 
     def add_frame(self, raw: bytes, turn_at: int | None, now_ns: int) -> LaserScan | None:
-        """Add a frame; `turn_at` is its first point in a new turn, whose end returns a scan."""
+        """Add a frame; `turn_at` is its first point of a new turn, which ends the current scan."""
         if turn_at is None:
             self.add((raw, WHOLE), ld.POINTS, now_ns)
             return None
@@ -53,10 +53,10 @@ class FrameBuffer(TurnBuffer[tuple[bytes, slice]]):
 
 
 class Ld(SerialSource):
-    """A lidar that sends LD frames. Subclasses name the model, its baud rate and its corrections.
+    """A lidar that sends LD frames. Subclasses set the model, its baud rate and its corrections.
 
-    Its 0 means free space or nothing measurable, so a body's file has `no_return: unknown` for it
-    where that matters.
+    Its 0 mm means free space, or an object that it cannot measure. If that matters, set
+    `no_return: unknown` in the body's file.
     """
 
     samples_hz = 4500.0
@@ -71,17 +71,17 @@ class Ld(SerialSource):
         self._last: int | None = None  # [0.01 deg], of the newest sample
 
     def to_axis(self, angles: Samples, distances: Samples) -> tuple[Samples, Samples]:
-        """Return angles (n,) [deg] and distances (n,) [mm] as they are seen from the axis."""
+        """Return angles (n,) [deg] and distances (n,) [mm] as seen from the axis."""
         return angles, distances
 
     def connected(self) -> None:
-        """Expect a new stream."""
+        """Reset all state for a new stream."""
         self._frames.clear()
         self._stamps.clear()
         self._last = None
 
     def received(self, data: bytes) -> None:
-        """Decode frames, or parts of them."""
+        """Decode frames; keep partial ones."""
         now_ns = self.clock.now_ns()
         for raw in self._decoder.cut(data):
             self.understood = True
@@ -91,7 +91,7 @@ class Ld(SerialSource):
             self.emit_scan(replace(scan, late_ms=self._stamps.late_ms) if scan else None)
 
     def probe(self, port: serial.Serial) -> bool:
-        """Return whether frames come from this port."""
+        """Return whether this port sends frames."""
         return len(ld.LdDecoder().feed(port.read(PROBE_BYTES))) >= PROBE_FRAMES
 
 
@@ -108,7 +108,7 @@ class Ld19(Ld):
 
 
 def turn_start(raw: ld.RawFrame, last: int | None) -> int | None:
-    """Return the first point of a frame that is in another turn than `last` [0.01 deg], or None."""
+    """Return the first point of a frame in a new turn since `last` [0.01 deg], or None."""
     if last is not None and raw.start < last - ld.TURN // 2:
         return 0
     if raw.end >= raw.start:
@@ -118,20 +118,20 @@ def turn_start(raw: ld.RawFrame, last: int | None) -> int | None:
 
 
 class Lds02(Ld):
-    """LDS-02 (LDROBOT LD08), the lidar of most TurtleBot3. Its lens is beside the axis."""
+    """LDS-02 (LDROBOT LD08), the lidar of most TurtleBot3. Its lens is not on the axis."""
 
     name, rate_baud = "LDS-02", 115_200
     samples_hz = 2300.0
 
     def to_axis(self, angles: Samples, distances: Samples) -> tuple[Samples, Samples]:
-        """Convert measurements from the lens to the axis."""
+        """Convert measurements by the lens to those from the axis."""
         return seen_from_axis(angles, distances)
 
 
 def seen_from_axis(angles: Samples, distances: Samples) -> tuple[Samples, Samples]:
-    """Convert measurements (n,) of the lens ([deg] clockwise, [mm]) to how the axis sees them.
+    """Convert measurements (n,) by the lens ([deg] clockwise, [mm]) to those from the axis.
 
-    Source: the vendor's ld08_driver, `SlTransform`. No return (0 mm) stays where it is.
+    Source: the vendor's ld08_driver, `SlTransform`. A missing return (0 mm) keeps its angle.
     """
     x, y = distances + OFFSET_X, SLANT * distances + OFFSET_Y
     seen = distances != 0

@@ -1,4 +1,4 @@
-"""LDS-01 and LDS-03, which turn and stop on command."""
+"""Emulated LDS-01 and LDS-03. They start and stop on command."""
 
 from typing import Any
 
@@ -7,15 +7,15 @@ from gigabrain_drivers.emulators.base import Device, EmulatedBody, Sample, Sweep
 from gigabrain_drivers.lidars.ld.emulator import MAX_SAG_VOLTS
 from gigabrain_drivers.lidars.lds import lds01, lds03
 
-LDS01_HZ = 5.0  # turns
+LDS01_HZ = 5.0  # turns per second
 LDS03_HZ, LDS03_SAMPLES_HZ = 10.0, 4000.0
-LDS03_POINTS = 20  # in a packet, at most
+LDS03_POINTS = 20  # maximum in a packet
 INTENSITY, QUALITY = 1000, 60
 COMMAND_BYTES = 4
 
 
 class Lds01Device(Device):
-    """Turns from `b` to `e`."""
+    """Turns from its start command `b` to its stop command `e`."""
 
     Options = ScanOptions
     baud = lds01.BAUD
@@ -36,7 +36,7 @@ class Lds01Device(Device):
         self._sweep.stop()
 
     def step(self, now_ns: int) -> None:
-        """Send all whole packets that were measured; the first begins where one does."""
+        """Send all complete packets. The first samples are skipped, up to the start of a packet."""
         while samples := self._sweep.next_samples(lds01.SAMPLES):
             first = round(samples[0].angle) - 1
             while first % lds01.SAMPLES:
@@ -76,7 +76,7 @@ class Lds03Device(Device):
         self._received = b"" if max(start, stop) >= 0 else self._received[-COMMAND_BYTES:]
 
     def step(self, now_ns: int) -> None:
-        """Send all whole packets that were measured; none crosses 0 degrees."""
+        """Send all complete packets; none crosses 0 degrees."""
         while samples := self._sweep.next_samples(1):
             wraps = bool(self._waiting) and samples[0].angle < self._waiting[-1].angle
             if wraps or len(self._waiting) == LDS03_POINTS:

@@ -1,7 +1,7 @@
-"""LDS-01 (Hitachi-LG HLS-LFCD2), the lidar of early TurtleBot3: 60 packets of 42 bytes a turn.
+"""LDS-01 (Hitachi-LG HLS-LFCD2), the lidar of early TurtleBot3. A turn is 60 packets of 42 bytes.
 
-Source: the vendor's driver hls_lfcd_lds_driver. It ignores the checksum, whose rule is not
-published; so a packet is known by its structure, and counts when the next one follows it at once.
+Source: the vendor's driver hls_lfcd_lds_driver. It ignores the checksum, which is not documented.
+So a packet is valid if its structure is right, and the header of the next one follows.
 """
 
 import struct
@@ -23,20 +23,20 @@ _SYNC, _FIRST = 0xFA, 0xA0
 
 PROBE_BYTES = 600  # fourteen packets
 PROBE_PACKETS = 3
-RESTART_NS = 1_000_000_000  # without a packet, until it is started again
+RESTART_NS = 1_000_000_000  # it is started again after this time without a packet
 
 
 class Lds01Packet(NamedTuple):
-    """Six of a turn's 360 samples; sample `6 * number + i` looks that many degrees clockwise."""
+    """Six of a turn's 360 samples, from sample `6 * number` on, clockwise."""
 
     number: int  # 0-59
     rpm: float
     intensities: tuple[int, ...]
-    ranges: tuple[int, ...]  # [mm], 0 where there was no return
+    ranges: tuple[int, ...]  # [mm], 0 without a return
 
 
 def encode(packet: Lds01Packet) -> bytes:
-    """Return the bytes of a packet. The checksum is the one that other drivers report."""
+    """Return the bytes of a packet, with the checksum that other drivers describe."""
     frame = struct.pack("<BBH", _SYNC, _FIRST + packet.number, round(packet.rpm * 10))
     for intensity, distance in zip(packet.intensities, packet.ranges, strict=True):
         frame += struct.pack("<HHH", intensity, distance, 0)
@@ -58,7 +58,7 @@ def describe_command(command: bytes) -> str:
 
 
 class Lds01Decoder(FrameDecoder[Lds01Packet]):
-    """Finds packets in whatever comes in; each waits for the header of the next."""
+    """Finds packets in a stream of bytes; each waits for the header of the next one."""
 
     HEADER = bytes([_SYNC])
 
@@ -82,7 +82,7 @@ class Lds01(SerialSource):
     """Turns from its start command to its stop command."""
 
     name = "LDS-01"
-    samples_hz, turns_hz = 1800.0, 5.0  # 300 rpm; it takes no speed
+    samples_hz, turns_hz = 1800.0, 5.0  # 300 rpm, fixed
 
     def __init__(self, options: Any, lidar: Lidar, clock: Clock) -> None:
         self._decoder = Lds01Decoder()
@@ -94,12 +94,12 @@ class Lds01(SerialSource):
         self._active_ns = 0  # time of the last start command or packet
 
     def connected(self) -> None:
-        """Start it."""
+        """Start the lidar."""
         self._last = None
         self._start()
 
     def received(self, data: bytes) -> None:
-        """Decode packets, or parts of them."""
+        """Decode packets; keep partial ones."""
         now_ns = self.clock.now_ns()
         for packet in self._decoder.feed(data):
             turn_at = 0 if self._last is not None and packet.number <= self._last else None
@@ -109,13 +109,13 @@ class Lds01(SerialSource):
             self.emit_scan(self.turn.add_samples(angles, packet.ranges, turn_at, now_ns))
 
     def watch_scans(self, now_ns: int) -> None:
-        """Start it again where it does not turn: it may have had no power before."""
+        """Start the lidar again if it does not turn: it may have had no power before."""
         super().watch_scans(now_ns)
         if now_ns - self._active_ns > RESTART_NS:
             self._start()
 
     def probe(self, port: serial.Serial) -> bool:
-        """Return whether packets come from this port after a start command."""
+        """Return whether this port sends packets after a start command."""
         port.write(START)
         found = len(Lds01Decoder().feed(port.read(PROBE_BYTES))) >= PROBE_PACKETS
         if not found:
@@ -123,7 +123,7 @@ class Lds01(SerialSource):
         return found
 
     def send_stop(self) -> bool:
-        """Stop it."""
+        """Stop the lidar."""
         return self.link.write(STOP)
 
     def _start(self) -> None:

@@ -1,4 +1,4 @@
-"""LDS-03 (COIN-D4), the lidar of late TurtleBot3: packets with a first and last angle.
+"""LDS-03 (COIN-D4), the lidar of late TurtleBot3. Packets have a first and a last angle.
 
 Source: the vendor's driver coin_d4_driver.
 """
@@ -21,12 +21,12 @@ _PREFIX = 10
 _TURN = 360.0
 
 PROBE_BYTES = 600
-DTR_NS = 100_000_000  # after opening, until the terminal-ready line is cleared
-START_NS = 1_000_000_000  # after opening, until it listens
-RESTART_NS = 3_000_000_000  # without a packet, until it is stopped and started
-REFLECTION_MM = 150  # up to here, a sample of at most this
-REFLECTION_QUALITY = 65  # is a reflection of the housing
-MIRROR_QUALITY = 255
+DTR_NS = 100_000_000  # from opening to the clearing of the data-terminal-ready line
+START_NS = 1_000_000_000  # from opening to the start command, because it boots
+RESTART_NS = 3_000_000_000  # it is stopped and started after this time without a packet
+REFLECTION_MM = 150  # a sample up to this distance,
+REFLECTION_QUALITY = 65  # and this quality, is a reflection of the housing
+MIRROR_QUALITY = 255  # replaces the quality of a mirror-like surface
 
 
 def command(code: int) -> bytes:
@@ -41,26 +41,26 @@ class Lds03Sample(NamedTuple):
     """One measurement."""
 
     angle: float  # [deg], clockwise, 0 up to 360
-    distance: int  # [mm], 0 where there was no return
+    distance: int  # [mm], 0 without a return
     quality: int  # 0-255
-    reflective: bool  # of a mirror-like surface
+    reflective: bool  # True for a mirror-like surface
 
 
 class Lds03Packet(NamedTuple):
-    """Samples in a row; `begins` a turn when the angle passes 0."""
+    """Consecutive samples. `begins` is True for the first packet of a turn."""
 
     begins: bool
-    rate: float  # [Hz] of turns; only sent where a turn begins, else 0
+    rate: float  # [Hz], turns per second; 0 unless a turn begins
     samples: tuple[Lds03Sample, ...]
 
 
 def encode(packet: Lds03Packet) -> bytes:
-    """Return the bytes of a packet of at least one sample; angles in between are spread evenly."""
+    """Return the bytes of a packet; it needs a sample, and angles at even intervals."""
     first, last = packet.samples[0].angle, packet.samples[-1].angle
     kind = packet.begins | round(packet.rate * 10) << 1
     head = struct.pack("<BBHH", kind, len(packet.samples), _angle(first), _angle(last))
     body = b"".join(_sample(sample) for sample in packet.samples)
-    return _HEADER + head + struct.pack("<H", _check(head, body)) + body
+    return _HEADER + head + struct.pack("<H", _checksum(head, body)) + body
 
 
 def describe(packet: Lds03Packet) -> str:
@@ -74,7 +74,7 @@ def describe(packet: Lds03Packet) -> str:
 
 
 class CommandDecoder:
-    """Finds commands in what goes to the lidar."""
+    """Finds commands in the bytes sent to the lidar."""
 
     def __init__(self) -> None:
         self._newest = b""
@@ -95,7 +95,7 @@ def describe_command(command: bytes) -> str:
 
 
 class Lds03Decoder(FrameDecoder[Lds03Packet]):
-    """Finds packets in whatever comes in."""
+    """Finds packets in a stream of bytes."""
 
     HEADER = _HEADER
 
@@ -106,12 +106,12 @@ class Lds03Decoder(FrameDecoder[Lds03Packet]):
         return _PREFIX + 3 * count if count and buffer[4] & buffer[6] & 1 else 0
 
     def _frame(self, data: bytes) -> Lds03Packet | None:
-        right = _check(data[2:8], data[_PREFIX:]) == int.from_bytes(data[8:10], "little")
-        return _packet(data) if right else None
+        valid = _checksum(data[2:8], data[_PREFIX:]) == int.from_bytes(data[8:10], "little")
+        return _packet(data) if valid else None
 
 
-def _check(head: bytes, body: bytes) -> int:
-    """Return the XOR of the packet's 16-bit words; each sample's first byte counts alone."""
+def _checksum(head: bytes, body: bytes) -> int:
+    """Return the XOR of the packet's 16-bit words; a sample's first byte is a word of its own."""
     low = xor_of(head[0::2]) ^ xor_of(body[0::3]) ^ xor_of(body[1::3])
     high = xor_of(head[1::2]) ^ xor_of(body[2::3])
     return 0x55AA ^ (low | high << 8)
@@ -122,7 +122,7 @@ def _angle(degrees: float) -> int:
 
 
 def _sample(sample: Lds03Sample) -> bytes:
-    """Pack `0bQQQQQQ0R 0bDDDDDDQQ 0bDDDDDDDD`, the lowest bits of quality and distance first."""
+    """Pack a sample as `0bQQQQQQ0R 0bDDDDDDQQ 0bDDDDDDDD`, with the lowest bits first."""
     return bytes(
         [
             (sample.quality & 0x3F) << 2 | sample.reflective,
@@ -163,16 +163,16 @@ class Lds03(SerialSource):
             Spelling(CommandDecoder().feed, describe_command),
             Spelling(Lds03Decoder().feed, describe),
         )
-        self._cleared = self._started = False
+        self._dtr_cleared = self._started = False
         self._active_ns = 0  # time of the last command or packet
 
     def connected(self) -> None:
-        """Leave it alone for a second; then `look` starts it."""
-        self._cleared = self._started = False
+        """Wait for its boot; `watch_scans` starts it."""
+        self._dtr_cleared = self._started = False
         self._active_ns = self.clock.now_ns()
 
     def received(self, data: bytes) -> None:
-        """Decode packets, or parts of them."""
+        """Decode packets; keep partial ones."""
         now_ns = self.clock.now_ns()
         for packet in self._decoder.feed(data):
             self.understood, self._active_ns = True, now_ns
@@ -182,21 +182,21 @@ class Lds03(SerialSource):
             self.emit_scan(self.turn.add_samples(angles, distances, turn_at, now_ns))
 
     def watch_scans(self, now_ns: int) -> None:
-        """Start it when it is ready for that, and again where it does not turn."""
+        """Start the lidar once it has booted, and again if it does not turn."""
         super().watch_scans(now_ns)
-        since = now_ns - self._active_ns
-        if not self._cleared and since >= DTR_NS:
+        silent_ns = now_ns - self._active_ns
+        if not self._dtr_cleared and silent_ns >= DTR_NS:
             self.link.set_dtr(False)
-            self._cleared = True
-        if not self._started and since >= START_NS:
+            self._dtr_cleared = True
+        if not self._started and silent_ns >= START_NS:
             self._send_command(START)
             self._started = True
-        elif self._started and since >= RESTART_NS:
+        elif self._started and silent_ns >= RESTART_NS:
             self._send_command(STOP)
             self._send_command(START)
 
     def probe(self, port: serial.Serial) -> bool:
-        """Return whether packets come from this port after a start command."""
+        """Return whether this port sends packets after a start command."""
         port.write(START)
         found = bool(Lds03Decoder().feed(port.read(PROBE_BYTES)))
         if not found:
@@ -204,7 +204,7 @@ class Lds03(SerialSource):
         return found
 
     def send_stop(self) -> bool:
-        """Stop it."""
+        """Stop the lidar."""
         return self.link.write(STOP)
 
     def _send_command(self, command: bytes) -> None:
@@ -213,7 +213,7 @@ class Lds03(SerialSource):
 
 
 def trusted(sample: Lds03Sample) -> float:
-    """Return the distance [mm] of a sample, nan where it is too near and too weak.
+    """Return the distance [mm] of a sample; nan if it is too near and too weak.
 
     Source: the vendor's coin_d4_driver.
     """

@@ -1,4 +1,4 @@
-"""An emulated RPLIDAR: answers requests, and streams standard, express or dense samples."""
+"""Emulated RPLIDARs. They answer requests, and stream standard, express or dense samples."""
 
 from pathlib import Path
 from typing import NamedTuple
@@ -24,12 +24,12 @@ from gigabrain_drivers.lidars.rplidar.scan_formats import (
 from gigabrain_drivers.lidars.rplidar.source import MODELS, RplidarOptions
 
 SAMPLES = {STANDARD: 1, EXPRESS: 32, DENSE: 40}  # in a block
-QUALITY = 47  # of a standard node that saw something
+QUALITY = 47  # of a standard node with a return
 SERIAL = "0123456789ABCDEF" * 2
 
 
 class Mode(NamedTuple):
-    """One scan mode, as in answers to GET_CONF."""
+    """A scan mode, as in answers to GET_CONF."""
 
     name: str
     kind: int  # answer type
@@ -37,12 +37,12 @@ class Mode(NamedTuple):
 
 
 class Unit(NamedTuple):
-    """The figures of one model."""
+    """Properties of a model."""
 
     info: Info
-    reach: tuple[float, float]  # [m]
-    modes: tuple[Mode, ...]  # the last is its typical one
-    board: bool = False  # whether an accessory board powers its motor
+    reach: tuple[float, float]  # [m], minimum and maximum range
+    modes: tuple[Mode, ...]  # the last one is the typical mode
+    board: bool = False  # True if an accessory board powers its motor
 
 
 UNITS = {
@@ -68,13 +68,13 @@ UNITS = {
         (Mode("Standard", STANDARD, 62.5), Mode("DenseBoost", DENSE, 31.25)),
     ),
 }
-LEGACY = Mode("Express", EXPRESS, 250)  # what an express request for mode 0 has always meant
+LEGACY = Mode("Express", EXPRESS, 250)  # mode 0 of express requests, in all firmware
 
 
 class RplidarDevice(Device):
-    """An RPLIDAR of the model in the options; an A1 where they leave it open.
+    """An RPLIDAR of the model in the options; `auto` is an A1.
 
-    A pty has no DTR line: the motors that hang on it turn all the time.
+    A pty has no DTR line, so motors that it controls turn all the time.
     """
 
     Options = RplidarOptions
@@ -86,24 +86,24 @@ class RplidarDevice(Device):
         self._requests = RequestDecoder()
         self._sweep = Sweep(body, *self.unit.reach)
         self._nominal_hz = body.robot.lidar.rate_hz if body.robot.lidar else 10.0
-        self._mode: Mode | None = None  # while it scans
+        self._mode: Mode | None = None  # None while it does not scan
         self._turn_hz = 0.0
-        self._first = False  # whether the next block is the first of its stream
+        self._first = False  # True if the next block is the first of its stream
         self._last_angle = 0.0
 
     @classmethod
     def port(cls, options: RplidarOptions) -> Port:
-        """A serial line at the model's speed."""
+        """Return a pty with the model's baud rate."""
         baud = MODELS["a1" if options.model == "auto" else options.model].baud
         return Pty(Path(options.port), baud)
 
     def feed(self, data: bytes) -> None:
-        """Obey requests, or collect parts of them."""
+        """Obey requests; keep partial ones."""
         for request in self._requests.feed(data):
             self._handle_request(request)
 
     def reset(self) -> None:
-        """Boot: the motor turns, unless a board powers it, and the banner is sent."""
+        """Boot: turn the motor, unless a board powers it, and send the banner."""
         self._halt()
         self.health = Health(0, 0)
         self._turn_hz = 0.0 if self.unit.board else self._nominal_hz
@@ -113,7 +113,7 @@ class RplidarDevice(Device):
         self.wire.write(banner.encode())
 
     def step(self, now_ns: int) -> None:
-        """Send all whole blocks that were measured; nodes in one piece."""
+        """Send all complete blocks; standard nodes in one write."""
         mode = self._mode
         if mode is None:
             return
@@ -136,7 +136,7 @@ class RplidarDevice(Device):
                 self.reset()
             case rplidar.SET_PWM | rplidar.SET_SPEED if len(payload) == 2:
                 self._set_motor(command, int.from_bytes(payload, "little"))
-            case _ if self._mode is None:  # while it scans, it ignores all else
+            case _ if self._mode is None:  # while it scans, it ignores other requests
                 self._answer(command, payload)
 
     def _answer(self, command: int, payload: bytes) -> None:
@@ -164,7 +164,7 @@ class RplidarDevice(Device):
         self.wire.write(rplidar.answer(kind, data))
 
     def _conf(self, key: int, number: int) -> bytes:
-        """Return the value of a setting, empty where there is none."""
+        """Return the value of a setting; empty if there is none."""
         modes = self.unit.modes
         if key == rplidar.MODE_COUNT:
             return len(modes).to_bytes(2, "little")
@@ -214,7 +214,7 @@ class RplidarDevice(Device):
 
 
 def emulated_unit(options: RplidarOptions) -> Unit:
-    """Return the emulated model; those without an entry of their own are like the A1 or the S2."""
+    """Return the emulated model; models without an entry are emulated as A1 or S2."""
     if options.model in UNITS:
         return UNITS[options.model]
     return UNITS["s2" if options.model == "s3" else "a1"]

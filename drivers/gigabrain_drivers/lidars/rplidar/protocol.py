@@ -1,7 +1,7 @@
-"""Slamtec RPLIDAR: requests to the lidar, its answers, and the stream of samples that follows.
+"""Protocol of Slamtec RPLIDARs: requests to the lidar, its answers, and its stream of samples.
 
-Request `A5 cmd`, with a payload (commands from 0x80) `A5 cmd size payload xor`. An answer begins
-with a descriptor of 7 bytes: `A5 5A`, u32 (size: 30 bits, endless: bit 30), type. Little-endian.
+A request is `A5 cmd`, or for commands from 0x80, `A5 cmd size payload xor`. An answer begins with
+a descriptor of 7 bytes: `A5 5A`, u32 (size: 30 bits, endless: bit 30), type. Little-endian.
 Sources: Slamtec's interface protocol document and the public rplidar_sdk.
 """
 
@@ -22,7 +22,7 @@ MODE_COUNT, MODE_MICROSECONDS, MODE_DISTANCE = 0x70, 0x71, 0x74  # keys of GET_C
 MODE_ANSWER, MODE_TYPICAL, MODE_NAME = 0x75, 0x7C, 0x7F
 
 _SIZES = {INFO: 20, HEALTH: 3, SAMPLERATE: 4, BOARD: 4}
-_MAX_CONF_BYTES = 64  # bytes
+_MAX_CONF_BYTES = 64
 _DESCRIPTOR = struct.Struct("<2sIB")
 _ENDLESS = 1 << 30
 _SYNC = b"\xa5\x5a"
@@ -34,7 +34,7 @@ REQUESTS = {
     GET_SAMPLERATE: "get sample rate", GET_BOARD: "get board",
     GET_CONF: "get setting", SET_SPEED: "set speed", SET_PWM: "set motor",
 }  # fmt: skip
-_BEFORE_CHECKSUM = 3  # bytes of a request with a payload before the payload
+_HEADER_BYTES = 3  # of a request with a payload
 
 
 def request(command: int, payload: bytes = b"") -> bytes:
@@ -46,18 +46,18 @@ def request(command: int, payload: bytes = b"") -> bytes:
 
 
 def express_request(mode: int = 0) -> bytes:
-    """Request the stream of scan mode `mode`; 0 is the express mode of old firmware."""
+    """Return a request for the stream of a scan mode; 0 is the express mode of old firmware."""
     return request(EXPRESS_SCAN, struct.pack("<BHH", mode, 0, 0))
 
 
 def conf_request(key: int, mode: int | None = None) -> bytes:
-    """Request a setting, some of which belong to a scan mode."""
+    """Return a request for a setting, or for the setting of a scan mode."""
     payload = struct.pack("<I", key) if mode is None else struct.pack("<IH", key, mode)
     return request(GET_CONF, payload)
 
 
 def answer(kind: int, data: bytes) -> bytes:
-    """Return a single answer with its descriptor."""
+    """Return an answer with its descriptor."""
     return descriptor(kind, len(data)) + data
 
 
@@ -76,7 +76,7 @@ class Info(NamedTuple):
 
     @classmethod
     def read(cls, data: bytes) -> Self:
-        """Decode the 20 bytes of its answer."""
+        """Decode the answer's 20 bytes."""
         return cls(data[0], (data[2], data[1]), data[3], data[4:].hex().upper())
 
     def pack(self) -> bytes:
@@ -86,14 +86,14 @@ class Info(NamedTuple):
 
 
 class Health(NamedTuple):
-    """The lidar's judgement of itself."""
+    """State of the lidar by its self-test."""
 
-    status: int  # 0 good, 1 warning, 2 error: it will not scan
+    status: int  # 0 good, 1 warning, 2 error; it does not scan after an error
     code: int
 
     @classmethod
     def read(cls, data: bytes) -> Self:
-        """Decode the 3 bytes of its answer."""
+        """Decode the answer's 3 bytes."""
         return cls(*struct.unpack("<BH", data))
 
     def pack(self) -> bytes:
@@ -102,24 +102,24 @@ class Health(NamedTuple):
 
 
 class Answer(NamedTuple):
-    """A single answer."""
+    """An answer without its descriptor."""
 
     kind: int
     data: bytes
 
 
 class RplidarDecoder:
-    """The host's side: answers and samples in a stream of bytes. Keeps less than 200 bytes."""
+    """Finds answers and samples in the bytes from the lidar. Keeps less than 200 bytes."""
 
     def __init__(self) -> None:
-        self.errors = 0  # how often something was thrown away
+        self.errors = 0  # number of times that bytes were dropped
         self.clear()
 
     def clear(self) -> None:
-        """Expect a descriptor next: after a stop request, or on another connection."""
+        """Expect a descriptor next: after a request, or for a new connection."""
         self._buffer = bytearray()
-        self._answer: tuple[int, int] | None = None  # kind and size of the one that is coming
-        self._format: ScanFormat | None = None  # of the stream that has begun
+        self._answer: tuple[int, int] | None = None  # kind and size of the announced answer
+        self._format: ScanFormat | None = None  # of the current stream
         self._in_step = True
 
     def feed(self, data: bytes) -> list[Answer | Samples]:
@@ -129,11 +129,11 @@ class RplidarDecoder:
         while self._format is None and self._next_answer(found):
             pass
         if self._format is not None:
-            self._blocks(self._format, found)
+            self._read_blocks(self._format, found)
         return found
 
     def _next_answer(self, found: list[Answer | Samples]) -> bool:
-        """Read one descriptor or announced answer. Return False if more has to come."""
+        """Read one descriptor or announced answer. Return False if bytes are missing."""
         buffer = self._buffer
         if self._answer:
             kind, size = self._answer
@@ -147,13 +147,13 @@ class RplidarDecoder:
         if at < 0:
             del buffer[: len(buffer) - buffer.endswith(_SYNC[:1])]
             return False
-        del buffer[:at]  # text of a reboot, the rest of a stream that was stopped
+        del buffer[:at]  # text of a reboot, or the rest of a stopped stream
         if len(buffer) < _DESCRIPTOR.size:
             return False
-        self._announced(*_DESCRIPTOR.unpack_from(buffer))
+        self._read_descriptor(*_DESCRIPTOR.unpack_from(buffer))
         return True
 
-    def _announced(self, _: bytes, word: int, kind: int) -> None:
+    def _read_descriptor(self, _: bytes, word: int, kind: int) -> None:
         size, endless = word & (_ENDLESS - 1), word >> 30
         if endless == 1 and kind in FORMATS and FORMATS[kind].size == size:
             self._format = FORMATS[kind]()
@@ -167,8 +167,8 @@ class RplidarDecoder:
             return
         del self._buffer[: _DESCRIPTOR.size]
 
-    def _blocks(self, format: ScanFormat, found: list[Answer | Samples]) -> None:
-        """Read all whole blocks of the stream; out of step, several in a row must agree."""
+    def _read_blocks(self, format: ScanFormat, found: list[Answer | Samples]) -> None:
+        """Read all complete blocks; out of step, `confirm` consecutive blocks must be valid."""
         buffer, size, at = self._buffer, format.size, 0
         while len(buffer) - at >= size * (1 if self._in_step else format.confirm):
             block = bytes(buffer[at : at + size])
@@ -185,7 +185,7 @@ class RplidarDecoder:
         del buffer[:at]
 
     def _confirmed(self, format: ScanFormat, at: int) -> bool:
-        """Return whether the blocks from `at` on follow each other, by a fresh format."""
+        """Return whether the blocks from `at` on follow each other."""
         trial, size = type(format)(), format.size
         for n in range(format.confirm):
             block = bytes(self._buffer[at + n * size : at + (n + 1) * size])
@@ -196,7 +196,7 @@ class RplidarDecoder:
 
 
 def describe(item: "Answer | Samples") -> str:
-    """Describe an answer or samples for the log; samples are those of the block before."""
+    """Describe an answer or samples for the log; samples are those of the last block."""
     if isinstance(item, Samples):
         seen = [distance for distance in item.distances if distance]
         span = f"{min(seen):.0f} to {max(seen):.0f} mm" if seen else "no return"
@@ -210,7 +210,7 @@ def describe(item: "Answer | Samples") -> str:
 
 
 class Request(NamedTuple):
-    """A host's request."""
+    """A request to the lidar."""
 
     command: int
     payload: bytes = b""
@@ -223,7 +223,7 @@ def describe_request(request: Request) -> str:
 
 
 class RequestDecoder:
-    """The lidar's side: requests in a stream of bytes. Keeps less than 260 bytes."""
+    """Finds requests in the bytes to the lidar. Keeps less than 260 bytes."""
 
     def __init__(self) -> None:
         self._buffer = bytearray()
@@ -234,23 +234,23 @@ class RequestDecoder:
         buffer, found = self._buffer, list[Request]()
         buffer += data
         while True:
-            self._skip()
+            self._drop_before_request()
             if len(buffer) < 2:
                 return found
             if buffer[1] < 0x80:
                 found.append(Request(buffer[1]))
                 del buffer[:2]
                 continue
-            if len(buffer) < _BEFORE_CHECKSUM or len(buffer) < buffer[2] + 4:
+            if len(buffer) < _HEADER_BYTES or len(buffer) < buffer[2] + 4:
                 return found
-            whole = bytes(buffer[: buffer[2] + 4])
-            if xor_of(whole) == 0:
-                found.append(Request(whole[1], whole[_BEFORE_CHECKSUM:-1]))
-                del buffer[: len(whole)]
+            frame = bytes(buffer[: buffer[2] + 4])
+            if xor_of(frame) == 0:
+                found.append(Request(frame[1], frame[_HEADER_BYTES:-1]))
+                del buffer[: len(frame)]
             else:
                 self.errors += 1
                 del buffer[:1]
 
-    def _skip(self) -> None:
+    def _drop_before_request(self) -> None:
         at = self._buffer.find(0xA5)
         del self._buffer[: at if at >= 0 else len(self._buffer)]

@@ -1,10 +1,10 @@
 """Sample formats of Slamtec RPLIDARs: standard nodes, express and dense capsules.
 
-Little-endian; angles run clockwise, in 1/64 degree (q6). Sources: Slamtec's interface protocol
-document and the public rplidar_sdk. Both ways, so that an emulator speaks what the driver reads.
+Little-endian; angles run clockwise, in 1/64 degree (q6). Encoders are for emulators. Sources:
+Slamtec's interface protocol document and the public rplidar_sdk.
 
-On a line with 0.1 % of all bytes wrong, of a million standard nodes, which have no checksum,
-0.25 % come out wrong; of 200000 capsules 15 % are lost and 3 or 4 wrong.
+With 0.1 % of all bytes wrong, 0.25 % of a million standard nodes, which have no checksum, were
+decoded wrong. Of 200000 capsules, 15 % were lost, and 3 or 4 were decoded wrong.
 """
 
 import abc
@@ -15,9 +15,9 @@ from typing import ClassVar, NamedTuple
 from gigabrain_drivers.links.frames import xor_of
 
 TURN_Q6 = 360 << 6
-MAX_JUMP_DEG = 25.0  # between two nodes in step; their triangulation shifts them by up to 8
-FULL_TURN_DEG = 400.0  # without the start of a turn: its node was lost
-MAX_WIDENING = 1.5  # a capsule this much wider than the last: one between them was lost
+MAX_JUMP_DEG = 25.0  # between consecutive nodes; triangulation shifts angles by up to 8
+MAX_TURN_DEG = 400.0  # after this angle, the first node of the next turn was lost
+MAX_WIDTH_RATIO = 1.5  # of two capsules; if it is larger, one between them was lost
 
 _NODE = struct.Struct("<BHH")
 _CABINS = struct.Struct("<" + "HHB" * 16)
@@ -25,23 +25,23 @@ _DENSE = struct.Struct("<40H")
 
 
 class Samples(NamedTuple):
-    """Measurements in the order they were made."""
+    """Consecutive measurements."""
 
     angles: tuple[float, ...]  # (n,) [deg], clockwise, 0 to 720
-    distances: tuple[float, ...]  # (n,) [mm], 0 where there was no return
-    turn_at: int | None  # index of the first of them that belongs to a new turn
+    distances: tuple[float, ...]  # (n,) [mm], 0 without a return
+    turn_at: int | None  # index of the first sample of a new turn
 
 
 class ScanFormat(abc.ABC):
     """Decodes samples in blocks of `size` bytes. The caller finds the blocks."""
 
     size: ClassVar[int]
-    kind: ClassVar[int]  # its answer type
-    confirm: ClassVar[int] = 1  # blocks in a row that prove that the stream is in step
+    kind: ClassVar[int]  # answer type
+    confirm: ClassVar[int] = 1  # the stream is in step after this many consecutive valid blocks
 
     @abc.abstractmethod
     def is_block(self, block: bytes) -> bool:
-        """Return whether these bytes can be a block that follows the last."""
+        """Return whether these bytes can be the block after the last one."""
 
     @abc.abstractmethod
     def decode(self, block: bytes) -> Samples | None:
@@ -49,35 +49,35 @@ class ScanFormat(abc.ABC):
 
     @abc.abstractmethod
     def resync(self) -> None:
-        """Note that bytes were lost: the next block does not follow the last."""
+        """Record that bytes were lost: the next block does not follow the last one."""
 
 
 class Standard(ScanFormat):
-    """A node of 5 bytes per sample. It has no checksum, so angles must go on from one another."""
+    """Nodes of 5 bytes, one per sample. Without a checksum, their angles must be continuous."""
 
     size, kind, confirm = 5, 0x81, 4
 
     def __init__(self) -> None:
         self._last: float | None = None  # [deg]
-        self._travelled = 0.0  # [deg], since the turn began
+        self._turned = 0.0  # [deg], since the start of the turn
 
     def is_block(self, block: bytes) -> bool:
-        """Judge by the sync bits, and by how far the angle has gone on."""
+        """Check the sync bits, and the step of the angle."""
         first, raw, _ = _NODE.unpack(block)
         if not (first ^ first >> 1) & 1 or not raw & 1 or raw >> 1 >= TURN_Q6:
             return False
         return self._last is None or abs(_advance(self._last, (raw >> 1) / 64)) < MAX_JUMP_DEG
 
     def decode(self, block: bytes) -> Samples:
-        """Return one sample. A turn begins with the node that is marked so."""
+        """Return one sample. The first node of a turn is marked."""
         first, raw, distance = _NODE.unpack(block)
         angle = (raw >> 1) / 64
         if self._last is not None:
-            self._travelled += _advance(self._last, angle)
+            self._turned += _advance(self._last, angle)
         self._last = angle
-        begins = bool(first & 1) or self._travelled > FULL_TURN_DEG
+        begins = bool(first & 1) or self._turned > MAX_TURN_DEG
         if begins:
-            self._travelled = 0.0
+            self._turned = 0.0
         return Samples((angle,), (distance / 4,), 0 if begins else None)
 
     def resync(self) -> None:
@@ -86,40 +86,40 @@ class Standard(ScanFormat):
 
 
 class Capsule(ScanFormat):
-    """Blocks of many samples; their angles lie between its start and the start of the next."""
+    """Blocks of many samples. Angles are interpolated up to the start of the next block."""
 
     size = 84
 
     def __init__(self) -> None:
-        self._held: bytes | None = None
-        self._width: float | None = None  # [deg], of the last capsule
+        self._last: bytes | None = None  # its samples need the next capsule
+        self._width: float | None = None  # [deg], of the capsule before it
 
     def is_block(self, block: bytes) -> bool:
-        """Judge by two sync nibbles and a checksum, the XOR of all after them."""
+        """Check the sync nibbles and the checksum."""
         if block[0] >> 4 != 0xA or block[1] >> 4 != 0x5 or _start(block) >= 360:
             return False
         return capsule_checksum(block) == (block[0] & 0xF | (block[1] & 0xF) << 4)
 
     def decode(self, block: bytes) -> Samples | None:
-        """Return the samples of the capsule before, where nothing is missing in between."""
-        held, self._held = self._held, block
-        if held is None or block[3] & 0x80:  # this one begins a new stream
+        """Return the samples of the last capsule, if none is missing in between."""
+        last, self._last = self._last, block
+        if last is None or block[3] & 0x80:  # this one begins a new stream
             self._width = None
             return None
-        start = _start(held)
+        start = _start(last)
         width = (_start(block) - start) % 360
-        usual, self._width = self._width, width
-        if usual is not None and width > usual * MAX_WIDENING + 1:
+        last_width, self._width = self._width, width
+        if last_width is not None and width > last_width * MAX_WIDTH_RATIO + 1:
             return None
-        passed = start + width >= 360
-        angles = self._angles(held, start, width)
+        passes_zero = start + width >= 360
+        angles = self._angles(last, start, width)
         count = len(angles)
-        turn_at = min(count - 1, -int((start - 360) * count // width)) if passed else None
-        return Samples(angles, self._distances(held), turn_at)
+        turn_at = min(count - 1, -int((start - 360) * count // width)) if passes_zero else None
+        return Samples(angles, self._distances(last), turn_at)
 
     def resync(self) -> None:
-        """Drop the capsule that waits for the next one."""
-        self._held = self._width = None
+        """Drop the last capsule."""
+        self._last = self._width = None
 
     @abc.abstractmethod
     def _angles(self, block: bytes, start: float, width: float) -> tuple[float, ...]: ...
@@ -129,7 +129,7 @@ class Capsule(ScanFormat):
 
 
 class Express(Capsule):
-    """32 samples in 16 cabins of {u16, u16, u8}: distances [mm], and how far angles deviate."""
+    """32 samples in 16 cabins of {u16, u16, u8}: distances [mm], and corrections of angles."""
 
     kind = 0x82
 
@@ -148,7 +148,7 @@ class Express(Capsule):
 
 
 class Dense(Capsule):
-    """40 distances u16 in mm, evenly spread."""
+    """40 distances, u16 [mm], at even intervals."""
 
     kind = 0x85
 
@@ -181,7 +181,7 @@ def encode_express(
     *,
     begins: bool,
 ) -> bytes:
-    """Return an express capsule of 32 samples, each angle less by its shift [deg/8], 0-63."""
+    """Return an express capsule of 32 samples; a shift [deg/8], 0-63, reduces its angle."""
     words = [
         min(0x3FFF, round(d)) << 2 | s >> 4 for d, s in zip(distances_mm, shifts_q3, strict=True)
     ]
@@ -206,5 +206,5 @@ def _start(block: bytes) -> float:
 
 
 def _advance(before: float, after: float) -> float:
-    """Return the way from one angle to the next [deg], -180 to 180."""
+    """Return the difference of two angles [deg], -180 to 180."""
     return (after - before + 180) % 360 - 180

@@ -1,4 +1,4 @@
-"""Slamtec's RPLIDARs: identified, spun up and set to scan; started again whenever silent."""
+"""Source for Slamtec RPLIDARs: identifies and starts them, and restarts them after silence."""
 
 import asyncio
 import logging
@@ -26,15 +26,15 @@ log = logging.getLogger(__name__)
 
 ANSWER_TIMEOUT_S = 0.5
 SPIN_UP_TIMEOUT_NS = 4_000_000_000  # from the request to scan to the first sample
-INFO_BYTES = 27  # its descriptor and itself
-SAMPLE_TIMEOUT_NS = 1_000_000_000  # then it is started again
+INFO_BYTES = 27  # size of the answer with its descriptor
+SAMPLE_TIMEOUT_NS = 1_000_000_000  # the lidar is started again after this time without samples
 PWM = 660  # of 1023, the vendor's usual motor power
-STOP_S = 0.1  # as the vendor waits after a stop
+STOP_S = 0.1  # pause after a stop request, as in the vendor's SDK
 RESET_S = 2.0
-PWM_FAMILIES = range(2, 6)  # which may sit on a board that powers the motor
-CONF_FIRMWARE = (1, 24)  # from here on it can be asked for its scan modes; C1 and later always
-CONF_FAMILY = 4
-EXPRESS_FIRMWARE = (1, 17)  # from here on it has the express mode
+PWM_FAMILIES = range(2, 6)  # may be on an accessory board that powers the motor
+CONF_FIRMWARE = (1, 24)  # first firmware that reports its scan modes,
+CONF_FAMILY = 4  # except from this family on, where all do
+EXPRESS_FIRMWARE = (1, 17)  # first firmware with the express mode
 
 
 ModelName = Literal["auto", "a1", "a2m8", "a2m12", "a3", "c1", "s1", "s2", "s3"]
@@ -48,19 +48,19 @@ KINDS = {"standard": rplidar.STANDARD, "express": rplidar.EXPRESS, "dense": rpli
 class RplidarOptions(ScanOptions, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """The RPLIDAR's part of a robot's file."""
 
-    model: ModelName = "auto"  # sets the baud rate; auto tries one after the other
-    scan_mode: ScanMode = "auto"  # the lidar's own choice, where it is one of the other three
+    model: ModelName = "auto"  # sets the baud rate; auto tries all
+    scan_mode: ScanMode = "auto"  # auto: the lidar's typical mode, if it is one of the other three
 
 
 class StartupError(Exception):
-    """The reason in one line why it does not scan."""
+    """The reason in one line why the lidar does not scan."""
 
 
 class ModelFigures(NamedTuple):
     """Baud rate and family of a model."""
 
     baud: int
-    family: int  # high nibble of the model that it reports
+    family: int  # high nibble of the reported model
 
 
 MODELS = {
@@ -76,13 +76,13 @@ MODELS = {
 
 
 async def start(lidar: "Rplidar", scan_mode: str) -> None:
-    """Bring the lidar from any state to a stream of samples. Raises StartupError.
+    """Start a stream of samples, from any state of the lidar. Raises StartupError.
 
-    The order is that of the vendor's SDK.
+    The order of requests is that of the vendor's SDK.
     """
     await _stop(lidar)
     info = Info.read(await lidar.ask(rplidar.request(rplidar.GET_INFO), rplidar.INFO))
-    lidar.identified(info, pwm=await _on_board(lidar, info))
+    lidar.identified(info, pwm=await _has_board(lidar, info))
     await _check_health(lidar)
     lidar.motor(on=True)
     await _stop(lidar)
@@ -96,7 +96,7 @@ async def start(lidar: "Rplidar", scan_mode: str) -> None:
 async def choose_mode(lidar: "Rplidar", info: Info, scan_mode: str) -> tuple[int, int]:
     """Return the answer type and number of the scan mode to use. Raises StartupError.
 
-    `auto` is the lidar's typical mode, or the fastest of those that are understood here.
+    `auto` is the lidar's typical mode, or the fastest one that this source can decode.
     """
     if info.firmware < CONF_FIRMWARE and info.model >> 4 < CONF_FAMILY:
         return _old_mode(info, scan_mode), 0
@@ -116,7 +116,7 @@ async def choose_mode(lidar: "Rplidar", info: Info, scan_mode: str) -> tuple[int
 
 
 def _old_mode(info: Info, scan_mode: str) -> int:
-    """Return the answer type of firmware that cannot be asked for its modes."""
+    """Return the answer type for firmware that does not report its modes."""
     has = {"standard": rplidar.STANDARD}
     if info.firmware >= EXPRESS_FIRMWARE:
         has |= {"auto": rplidar.EXPRESS, "express": rplidar.EXPRESS}
@@ -131,12 +131,12 @@ async def _stop(lidar: "Rplidar") -> None:
     await asyncio.sleep(STOP_S)
 
 
-async def _on_board(lidar: "Rplidar", info: Info) -> bool:
+async def _has_board(lidar: "Rplidar", info: Info) -> bool:
     if info.model >> 4 not in PWM_FAMILIES:
         return False
     try:
         flags = await lidar.ask(rplidar.request(rplidar.GET_BOARD, bytes(4)), rplidar.BOARD)
-    except StartupError:  # without a board there is no answer
+    except StartupError:  # there is no answer without a board
         return False
     return bool(flags[0] & 1)
 
@@ -170,8 +170,8 @@ def _number(data: bytes) -> int:
 class Rplidar(SerialSource):
     """An RPLIDAR of the A, C or S series.
 
-    Its 0 may be free space or nothing measurable: a body's file has `no_return: unknown` for it
-    where that matters.
+    Its 0 mm means free space, or an object that it cannot measure. If that matters, set
+    `no_return: unknown` in the body's file.
     """
 
     Options = RplidarOptions
@@ -188,18 +188,18 @@ class Rplidar(SerialSource):
             Spelling(rplidar.RplidarDecoder().feed, rplidar.describe),
         )
         self._connected = asyncio.Event()
-        self._asked: tuple[int, asyncio.Future[bytes]] | None = None
-        self._trouble = self._stranger = ""
+        self._asked: tuple[int, asyncio.Future[bytes]] | None = None  # type and awaited answer
+        self._failure = self._other_lidar = ""
         self._samples_ns = 0
         self._info: Info | None = None
-        self._pwm = False  # whether an accessory board powers its motor
+        self._pwm = False  # True if an accessory board powers its motor
 
     def connected(self) -> None:
-        """Let the start-up begin."""
+        """Let `run` start the lidar."""
         self._connected.set()
 
     def received(self, data: bytes) -> None:
-        """Decode answers and samples, or parts of them."""
+        """Decode answers and samples; keep partial ones."""
         now_ns = self.clock.now_ns()
         for item in self._decoder.feed(data):
             self.understood = True
@@ -212,29 +212,29 @@ class Rplidar(SerialSource):
 
     def explain(self) -> str:
         """Return why the last start-up failed."""
-        return self._trouble or super().explain()
+        return self._failure or super().explain()
 
     def explain_silence(self) -> str:
-        """Return the same text for all baud rates that are tried, so that it is logged once."""
+        """Return one text for all tried baud rates, so that it is logged once."""
         model = self.options.model
         if model != "auto":
             return f"{super().explain_silence()} (model: {model})"
-        self._stranger = self.other_lidar() or self._stranger
-        guess = f"it looks like {self._stranger}" if self._stranger else "is it powered?"
+        self._other_lidar = self.other_lidar() or self._other_lidar
+        guess = f"it looks like {self._other_lidar}" if self._other_lidar else "is it powered?"
         bauds = ", ".join(map(str, BAUDS))
         return f"no {self.name} answers on {self.link} at any of {bauds} baud: {guess}"
 
     def probe(self, port: serial.Serial) -> bool:
-        """Return whether an RPLIDAR answers here, at any of the baud rates that are tried."""
+        """Return whether an RPLIDAR answers on this port, at any baud rate of the model."""
         for baud in self._bauds:
             port.baudrate = baud
             if is_rplidar(port):
-                self._use(baud)
+                self._set_baud(baud)
                 return True
         return False
 
     async def run(self) -> None:
-        """Start it, and start it again whenever it falls silent; until cancelled."""
+        """Start the lidar, and restart it after silence; until cancelled."""
         async with asyncio.TaskGroup() as tasks:
             tasks.create_task(self._keep_scanning())
             async for now_ns in self.clock.every(CHECK_PERIOD_NS):
@@ -246,15 +246,15 @@ class Rplidar(SerialSource):
         self.motor(on=False)
         return True
 
-    # What the start-up needs.
+    # For `start`.
 
     def send(self, data: bytes) -> None:
-        """Send bytes to the lidar, if it is there. What comes back begins with a descriptor."""
+        """Send a request if the line is open; its answer begins with a descriptor."""
         self._decoder.clear()
         self.link.write(data)
 
     async def ask(self, request: bytes, kind: int) -> bytes:
-        """Return the single answer to a request. Raises StartupError."""
+        """Return the answer to a request. Raises StartupError."""
         future: asyncio.Future[bytes] = asyncio.get_running_loop().create_future()
         self._asked = kind, future
         self.send(request)
@@ -271,7 +271,7 @@ class Rplidar(SerialSource):
             self._asked = None
 
     def motor(self, *, on: bool) -> None:
-        """Switch the motor by this model's means: DTR line (cleared: it turns), PWM or a speed."""
+        """Switch the motor by the DTR line (cleared: it turns), and by PWM or speed."""
         self.link.set_dtr(not on)
         family = self._info.model >> 4 if self._info else 0
         if self._pwm:
@@ -281,7 +281,7 @@ class Rplidar(SerialSource):
             self.send(rplidar.request(rplidar.SET_SPEED, rpm.to_bytes(2, "little")))
 
     def identified(self, info: Info, *, pwm: bool) -> None:
-        """Keep the lidar's identity, and log it when it is new."""
+        """Store the lidar's identity, and log it if it is new."""
         if self._info != info:
             major, minor = info.firmware
             model = FAMILIES.get(info.model >> 4, f"model 0x{info.model:02x}")
@@ -301,10 +301,10 @@ class Rplidar(SerialSource):
             try:
                 await start(self, self.options.scan_mode)
                 await self._follow(connection)
-            except StartupError as trouble:
-                self._trouble = str(trouble)
+            except StartupError as error:
+                self._failure = str(error)
                 self._next_baud()
-                self.link.drop(self._trouble)
+                self.link.drop(self._failure)
 
     async def _follow(self, connection: int) -> None:
         """Return when the connection is lost. Raises StartupError when samples stop."""
@@ -313,16 +313,16 @@ class Rplidar(SerialSource):
             if not self.link.connected or self.link.reconnects != connection:
                 return
             if self._samples_ns > began_ns:
-                limit, self._trouble = SAMPLE_TIMEOUT_NS, ""
+                limit, self._failure = SAMPLE_TIMEOUT_NS, ""
             if now_ns - max(self._samples_ns, began_ns) > limit:
                 raise StartupError(f"the {self.name} on {self.link} answered, but sends no samples")
 
     def _next_baud(self) -> None:
-        """Try the next baud rate, where the model is not known and nothing was understood."""
+        """Try the next baud rate, if the model is not known and no data were valid."""
         if not self.understood:
-            self._use(self._bauds[1 % len(self._bauds)])
+            self._set_baud(self._bauds[1 % len(self._bauds)])
 
-    def _use(self, baud: int) -> None:
+    def _set_baud(self, baud: int) -> None:
         at = self._bauds.index(baud)
         self._bauds = self._bauds[at:] + self._bauds[:at]
         self.baud = self.link.baud = baud
@@ -334,7 +334,7 @@ class Rplidar(SerialSource):
 
 
 def is_rplidar(port: serial.Serial) -> bool:
-    """Return whether an RPLIDAR answers at the port's present baud rate."""
+    """Return whether an RPLIDAR answers at the port's baud rate."""
     port.write(rplidar.request(rplidar.STOP))
     time.sleep(STOP_S)
     port.reset_input_buffer()
