@@ -1,9 +1,8 @@
-"""The tables of drivers, lidars and cameras. Adding one is a folder, and one entry here.
+"""Tables of drivers, lidars and cameras. To add one, add a folder, and an entry here.
 
-Each names both ends of a wire: the driver of a body, or the source of a lidar's scans, and the
-emulator that answers it; of a camera there is its source only. Packages offer theirs as entry
-points in the groups `gigabrain.drivers`, `gigabrain.lidars`, `gigabrain.cameras` and
-`gigabrain.emulators`.
+An entry names both ends of a wire: a body's driver or a lidar's scan source, and the emulator that
+answers it. Cameras have no emulator. Other packages offer theirs as entry points in the groups
+`gigabrain.drivers`, `gigabrain.lidars`, `gigabrain.cameras` and `gigabrain.emulators`.
 """
 
 from typing import NamedTuple
@@ -12,11 +11,11 @@ from typing import NamedTuple
 class Ends(NamedTuple):
     """Both ends of a wire, each as "module:class" and imported only when used."""
 
-    host: str  # a driver.base.Driver, or of a lidar its lidars.base.ScanSource
-    emulator: str = ""  # an emulators.base.Device; empty where there is no wire
+    host: str  # a driver.base.Driver; for a lidar, a lidars.base.ScanSource
+    emulator: str = ""  # an emulators.base.Device; empty without a wire
 
 
-# by the name in a robot's file: `driver: NAME` of a link
+# by the name in a robot's file: `driver: NAME` in a link
 DRIVERS = {
     "alpha": Ends(
         "gigabrain_drivers.bodies.alpha.driver:AlphaDriver",
@@ -46,7 +45,7 @@ DRIVERS = {
     ),
 }
 
-# by the name in a robot's file: `scan: {driver: NAME}` of a link
+# by the name in a robot's file: `scan: {driver: NAME}` in a link
 LIDARS = {
     "ld06": Ends(
         "gigabrain_drivers.lidars.ld.source:Ld06",
@@ -75,7 +74,7 @@ LIDARS = {
 }
 
 
-# by the name in a robot's file: `cameras: {front: {source: NAME}}` of a link
+# by the name in a robot's file: `cameras: {front: {source: NAME}}` in a link
 CAMERAS = {
     "mujoco": "gigabrain_drivers.cameras.rendered:RenderedCamera",
     "opencv": "gigabrain_drivers.cameras.opencv:OpenCvCamera",
@@ -84,10 +83,10 @@ CAMERAS = {
 
 
 def shipped_hosts(table: dict[str, Ends]) -> dict[str, str]:
-    """Return the host's end of each entry, by name."""
+    """Return the host end of each entry, by name."""
     return {name: ends.host for name, ends in table.items()}
 
 
 def shipped_emulators() -> dict[str, str]:
-    """Return the emulator's end of each driver and lidar that has one, by name."""
+    """Return the emulator of each driver and lidar that has one, by name."""
     return {name: ends.emulator for name, ends in (DRIVERS | LIDARS).items() if ends.emulator}

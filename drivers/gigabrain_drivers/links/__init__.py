@@ -1,4 +1,4 @@
-"""Bytes to and from bodies: serial lines, TCP connections and CAN buses. They reconnect.
+"""Serial lines, TCP connections and CAN buses to bodies, which reconnect after a loss.
 
 Imports no other room of this package and no bus. Drivers, lidars and other packages import it.
 """

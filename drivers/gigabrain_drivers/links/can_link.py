@@ -20,14 +20,14 @@ from gigabrain_zenoh.host.files import read_bounded
 
 BITRATE = 1_000_000  # [bit/s]
 QUIET_NS = 200_000_000  # the bus is opened again after this time without a frame
-MAX_FRAMES = 256  # read at once
-MAX_ID, MAX_BYTES = 0x7FF, 8  # of classic CAN with standard identifiers
-HOPS = 0  # of multicast: frames do not leave this machine
+MAX_FRAMES = 256  # in one read
+MAX_ID, MAX_BYTES = 0x7FF, 8  # of a classic CAN frame with a standard identifier
+HOP_LIMIT = 0  # of multicast: frames do not leave this machine
 ARPHRD_CAN = 280  # type of CAN interfaces in sysfs
 IFF_UP = 1
 SYS_NET = Path("/sys/class/net")
-SYS_FILES = ("type", "flags")  # of an interface in SYS_NET
-MAX_ADDRESS_BYTES = 256  # size of a file with an address
+SYS_FILES = ("type", "flags")  # files of an interface in SYS_NET
+MAX_ADDRESS_BYTES = 256  # in a file with an address
 _RECORD = struct.Struct("<IB3x8s")
 _INTERFACE = re.compile(r"[A-Za-z][A-Za-z0-9_.-]{0,14}")
 _ADDRESS = re.compile(r"udp (\d+\.\d+\.\d+\.\d+) (\d{1,5})")
@@ -40,12 +40,12 @@ class CanFrame(NamedTuple):
     data: bytes
 
     def record(self) -> bytes:
-        """Return its record of 16 bytes."""
+        """Return the frame as a record of 16 bytes."""
         return _RECORD.pack(self.id, len(self.data), self.data)
 
 
 def records(frames: Iterable[CanFrame]) -> bytes:
-    """Return frames as the bytes that a link carries."""
+    """Return frames as consecutive records, which a link carries."""
     return b"".join(frame.record() for frame in frames)
 
 
@@ -57,10 +57,10 @@ class CanDecoder:
 
     def feed(self, data: bytes) -> list[CanFrame]:
         """Return the frames in whole records; drop a partial record, as an error."""
-        whole = len(data) - len(data) % _RECORD.size
-        self.errors += whole != len(data)
+        size = len(data) - len(data) % _RECORD.size
+        self.errors += size != len(data)
         frames = list[CanFrame]()
-        for id_, length, payload in _RECORD.iter_unpack(data[:whole]):
+        for id_, length, payload in _RECORD.iter_unpack(data[:size]):
             if id_ > MAX_ID or length > MAX_BYTES:
                 self.errors += 1
             else:
@@ -69,7 +69,7 @@ class CanDecoder:
 
 
 class CanSpelling(Spelling):
-    """One direction of a bus in words: identifier, bytes, and their meaning."""
+    """Describes one direction of a bus: identifier, bytes, and meaning of each frame."""
 
     def __init__(self, describe: Callable[[CanFrame], str]) -> None:
         super().__init__(CanDecoder().feed, describe)
@@ -92,7 +92,7 @@ def describe_interface(name: str, folder: Path = SYS_NET) -> str:
     """Return why a CAN interface cannot be used, in one line; empty if it can."""
     entry = folder / name
     try:
-        kind, flags = ((entry / one).read_text(encoding="ascii").strip() for one in SYS_FILES)
+        kind, flags = ((entry / file).read_text(encoding="ascii").strip() for file in SYS_FILES)
     except OSError:
         others = [path.parent.name for path in folder.glob("*/type") if _is_can(path)]
         has = f"; there is {', '.join(sorted(others))}" if others else ""
@@ -114,7 +114,7 @@ def _is_can(path: Path) -> bool:
 def open_multicast(group: str, port: int) -> can.BusABC:
     """Open a CAN bus on this machine, by UDP multicast. Raises LinkProblem."""
     try:
-        return UdpMulticastBus(group, port=port, hop_limit=HOPS, fd=False)
+        return UdpMulticastBus(group, port=port, hop_limit=HOP_LIMIT, fd=False)
     except (can.CanError, OSError) as error:
         raise LinkProblem(f"CAN by UDP {group} port {port}: {describe_can(error)}") from None
 
@@ -137,9 +137,9 @@ class CanLink(Link):
     ) -> None:
         super().__init__(clock)
         self._port, self.quiet_ns = port, quiet_ns
-        self._filters: list[Any] = [{"can_id": each, "can_mask": MAX_ID} for each in ids]
+        self._filters: list[Any] = [{"can_id": id_, "can_mask": MAX_ID} for id_ in ids]
         self._bus: can.BusABC | None = None
-        self.lost_frames = 0  # received, but not data frames: such as error frames
+        self.lost_frames = 0  # received frames that are not data frames, such as error frames
 
     def __str__(self) -> str:
         return self._port
@@ -180,18 +180,18 @@ class CanLink(Link):
             bus.shutdown()
 
     def _cut_short(self) -> None:
-        """Do nothing: frames are sent whole or not at all."""
+        """Do nothing: there are no partial frames."""
 
     def _read(self, fd: int) -> bool:
         """Read the waiting frames; return whether there were any."""
         if self._bus is None:
             return False
         try:
-            frames, wrong = receive(self._bus)
+            frames, others = receive(self._bus)
         except OSError as error:
             self.drop(describe_error(error))
             return False
-        self.lost_frames += wrong
+        self.lost_frames += others
         if not frames:
             return False
         self._received_ns = self._clock.now_ns()
@@ -206,22 +206,22 @@ def receive(bus: can.BusABC) -> tuple[list[CanFrame], int]:
 
     Raises OSError if the bus is gone.
     """
-    frames, wrong = list[CanFrame](), 0
+    frames, others = list[CanFrame](), 0
     for _ in range(MAX_FRAMES):
         try:
             message = bus.recv(0)
         except can.CanOperationError as error:
             if isinstance(error.__cause__, OSError):
                 raise error.__cause__ from None
-            wrong += 1
+            others += 1
             continue
         if message is None:
             break
         if message.is_extended_id or message.is_remote_frame or message.is_error_frame:
-            wrong += 1
+            others += 1
         else:
             frames.append(CanFrame(message.arbitration_id, bytes(message.data)))
-    return frames, wrong
+    return frames, others
 
 
 def message_of(frame: CanFrame) -> can.Message:
@@ -230,7 +230,7 @@ def message_of(frame: CanFrame) -> can.Message:
 
 
 def address_text(group: str, port: int) -> str:
-    """Return the text of a file that names a bus by UDP multicast."""
+    """Return the text of a file that names a bus on UDP multicast."""
     return f"udp {group} {port}\n"
 
 

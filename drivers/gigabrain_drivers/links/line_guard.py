@@ -1,9 +1,9 @@
 """A process that stops motors over a serial line when their driver dies or hangs.
 
 Motors without a watchdog keep turning when their commands end. So the driver starts this process,
-which shares its line, and reports each command to it: moving, or at rest. When reports of moving
-motors end, or the driver is gone, the process writes a frame that stops the motors. It cannot help
-if the line itself is cut, or the computer is off.
+which shares its line, and reports each command to it: moving, or at rest. If the driver ends or
+falls silent while motors move, the process writes a frame that stops them. It cannot help if the
+line is cut, or the computer is off.
 
 The process loads only this file and the standard library.
 """
@@ -17,24 +17,24 @@ import sys
 import time
 
 MOVING, AT_REST, QUIT = b"m", b"0", b"q"
-SILENCE_NS = 100_000_000  # from the last report of moving motors to their stop
-STOPS_NS = 200_000_000  # stop frames are repeated this long, as a single one may get lost
+SILENCE_NS = 100_000_000  # motors are stopped after this time without a report that they move
+STOPS_NS = 200_000_000  # stop frames are repeated this long, because one may get lost
 PERIOD_NS = 20_000_000
-CLOSE_S = 1.0
+CLOSE_TIMEOUT_S = 1.0
 
 
 class GuardState:
     """Decides when to stop motors. Pure."""
 
     def __init__(self, silence_ns: int = SILENCE_NS, stops_ns: int = STOPS_NS) -> None:
-        """Set the allowed silence of a moving driver, and the duration of stop frames [ns]."""
-        self.gone = False  # the driver has ended
+        """Set the silence before a stop, and the duration of stop frames [ns]."""
+        self.gone = False  # True once the driver ended
         self._silence_ns, self._stops_ns = silence_ns, stops_ns
         self._moving_ns: int | None = None  # time of the last report of moving motors
         self._stop_ns: int | None = None  # start of stopping them
 
     def take(self, words: bytes, now_ns: int) -> None:
-        """Handle the driver's reports; no bytes mean that it has ended."""
+        """Handle the driver's reports; no bytes mean that the driver ended."""
         if not words:
             self.gone = True
             return
@@ -58,10 +58,10 @@ class GuardState:
 
 
 class LineGuard:
-    """The driver's end: starts the process, and restarts it if it ends."""
+    """The driver's side: starts the process, and restarts it if it ends."""
 
     def __init__(self, frame: bytes) -> None:
-        """`frame` stops the motors."""
+        """Set the frame that stops the motors."""
         self._frame = frame
         self._process: subprocess.Popen[bytes] | None = None
         self._fd: int | None = None  # of the shared line
@@ -92,7 +92,7 @@ class LineGuard:
         if process.stdin:
             process.stdin.close()
         try:
-            process.wait(CLOSE_S)
+            process.wait(CLOSE_TIMEOUT_S)
         except subprocess.TimeoutExpired:  # it hangs
             process.kill()
             process.wait()
@@ -111,12 +111,12 @@ class LineGuard:
     def _write(self, word: bytes) -> None:
         assert self._process
         assert self._process.stdin
-        with contextlib.suppress(OSError):  # an ended process is restarted, one that hangs is left
+        with contextlib.suppress(OSError):  # it ended or hangs; `tell` restarts it only if it ended
             os.write(self._process.stdin.fileno(), word)
 
 
 def guard(fd: int, frame: bytes) -> None:
-    """Guard the motors on a line until the driver has ended and they are stopped."""
+    """Guard the motors on a line until the driver ended and they are stopped."""
     state, words = GuardState(), sys.stdin.fileno()
     while not state.ended(time.monotonic_ns()):
         waits_for = [] if state.gone else [words]

@@ -1,4 +1,4 @@
-"""Links: send and receive bytes on a port that is reopened after every loss."""
+"""Links: they send and receive bytes on a port, and reopen it after every loss."""
 
 import abc
 import asyncio
@@ -20,7 +20,7 @@ Trace = Callable[[str, bytes], None]
 
 FIRST_RETRY_NS = 100_000_000
 MAX_RETRY_NS = 1_000_000_000
-AGE_CHECK_S = 0.02  # between two checks of the age of the newest bytes
+AGE_CHECK_S = 0.02  # period of checking the age of the newest bytes
 READ_BYTES = 65536
 
 LOG_AFTER_NS = 500_000_000  # silence is logged after this time
@@ -31,20 +31,20 @@ class LinkProblem(Exception):
 
 
 class Link(abc.ABC):
-    """Bytes to and from a body. After `open` it reconnects by itself until `close`.
+    """A connection to a body. After `open`, it reconnects by itself until `close`.
 
     Subclasses implement the connection. All callbacks run on the loop.
     """
 
     quiet_ns: int | None = None  # the peer counts as lost after this time without a byte
-    gather_s = 0.0  # bytes within this time are read together, to save wake-ups
+    gather_s = 0.0  # bytes within this time are read together, to reduce wake-ups
 
     def __init__(self, clock: Clock) -> None:
         self.on_bytes: Callable[[bytes], None] = _ignore
         self.on_open: Callable[[], None] = _nothing
         self.on_lost: Callable[[str], None] = _ignore
         self.trace: Trace | None = None  # ("tx" or "rx", bytes)
-        self.wording = Wording()  # for the debug log; the owner sets that of its protocol
+        self.wording = Wording()  # for the debug log; set by the owner
         self.problem = "not opened"
         self.errors = 0  # frames that the owner dropped
         self.reconnects = 0
@@ -151,7 +151,7 @@ class Link(abc.ABC):
         while True:
             try:
                 fd = await self._connect()
-            except Exception as error:  # noqa: BLE001 - the port may be good in a moment
+            except Exception as error:  # noqa: BLE001 - it tries again
                 self._report(error)
                 self.problem = describe_error(error)
                 await self._clock.sleep_ns(retry_ns)
@@ -161,21 +161,21 @@ class Link(abc.ABC):
             try:
                 self._attach(fd)
                 await self._until_ended()
-            except Exception as error:  # noqa: BLE001 - of this connection; the next may be good
+            except Exception as error:  # noqa: BLE001 - it connects again
                 self._report(error)
                 self.drop(describe_error(error))
             await self._clock.sleep_ns(retry_ns)
 
     def _call(self, callback: Callable[[T], None], value: T) -> None:
-        """Call the owner; if it raises, drop the connection and open a new one."""
+        """Call the owner; if it raises, drop the connection."""
         try:
             callback(value)
-        except Exception as error:  # noqa: BLE001 - its fault must not end the link
+        except Exception as error:  # noqa: BLE001 - a fault of the owner must not end the link
             self._report(error)
             self.drop(f"received data could not be handled: {describe_error(error)}")
 
     def _report(self, error: Exception) -> None:
-        """Log an exception that is a programming error, once for each."""
+        """Log an exception once, if it is a programming error."""
         text = f"{type(error).__name__}: {error}"
         if not isinstance(error, (LinkProblem, OSError)) and text not in self._reported:
             self._reported.add(text)
@@ -230,7 +230,7 @@ class Link(abc.ABC):
         except OSError as error:
             self.drop(describe_error(error))
             return False
-        if not data:  # the other end is gone; its reader would be called for ever
+        if not data:  # end of file: the reader would be called for ever
             self.drop("the other end is gone: unplugged?")
             return False
         self._received_ns = self._clock.now_ns()
@@ -258,7 +258,7 @@ class Liveness:
     """Watches whether a body still sends its reports; logs each change once.
 
     The body counts as lost after `silent_ns` without a message. The text `senseless` is logged if
-    the line itself works. Short silence is not logged; the gate reports it.
+    the line works, but no message is valid. A short silence is not logged; the gate reports it.
     """
 
     def __init__(
@@ -268,7 +268,7 @@ class Liveness:
         self._silent_ns, self._senseless = silent_ns, senseless
         self._received_ns: int | None = None  # None: no message since the line was opened or lost
         self._silent_since_ns = clock.now_ns()
-        self._lost = False  # a loss was reported since the newest message
+        self._lost = False  # True after a loss, until the next message
         self._fault = Fault(log)
 
     @property

@@ -1,4 +1,4 @@
-"""Serial lines, opened by pyserial and used by the event loop; and the names of ports.
+"""Serial lines, opened by pyserial and used by the event loop, and names of ports.
 
 A port's name is a path, `usb:VID:PID[:SERIAL]`, or `auto`.
 """
@@ -22,7 +22,7 @@ AUTO = "auto"
 USB = "usb:"
 _ID = re.compile(r"[0-9A-Fa-f]{1,4}")
 
-NO_PORT = (errno.ENOTTY, errno.EINVAL, errno.EISDIR)  # errors of files, folders, other devices
+NO_PORT = (errno.ENOTTY, errno.EINVAL, errno.EISDIR)  # errors of files, folders and other devices
 Probe = Callable[[serial.Serial], bool]
 NO_MODEM_LINES = (errno.ENOTTY, errno.EINVAL)  # errors of ptys and some USB adapters
 
@@ -69,7 +69,7 @@ def candidate_paths(port: str) -> list[str]:
 
 
 def describe_missing(port: str) -> str:
-    """Return the text for a missing device."""
+    """Return the error text for a missing device."""
     if port == AUTO:
         return "no serial port at all: is it plugged in?"
     what = "USB device " if port.startswith(USB) else ""
@@ -77,14 +77,14 @@ def describe_missing(port: str) -> str:
 
 
 def describe_absent(port: str) -> str:
-    """Return the text for a missing port; empty if it exists. Raises ValueError."""
+    """Return the error text for a missing port; empty if it exists. Raises ValueError."""
     return (
         "" if any(Path(path).exists() for path in candidate_paths(port)) else describe_missing(port)
     )
 
 
 def describe_refusal(path: str, error: OSError) -> str:
-    """Return the text for a device that exists but cannot be opened."""
+    """Return the error text for a device that cannot be opened."""
     if error.errno in (errno.EACCES, errno.EPERM):
         return (
             f"no permission to open {path}; add yourself to its group (dialout on Debian), or "
@@ -101,14 +101,14 @@ def describe_refusal(path: str, error: OSError) -> str:
 
 
 def _holders(path: str) -> list[int]:
-    """Return the ids of processes that have the device open, as far as visible (Linux)."""
+    """Return the ids of processes that have the device open, if they are visible (Linux)."""
     device, found = os.path.realpath(path), []
     for entry in Path("/proc").glob("[0-9]*/fd/*"):
         try:
             if os.readlink(entry) == device:
                 found.append(int(entry.parts[2]))
         except OSError:
-            continue  # no permission, or gone meanwhile
+            continue  # no permission, or already closed
     return sorted(set(found))
 
 
@@ -121,7 +121,7 @@ class SerialLink(Link):
 
     def __init__(self, port: str, baud: int, clock: Clock, *, probe: Probe | None = None) -> None:
         super().__init__(clock)
-        self.baud = baud  # used from the next connection on
+        self.baud = baud  # a change is used at the next connection
         self._port, self._probe = port, probe
         self._serial: serial.Serial | None = None
         self.path = ""  # of the newest opened device
@@ -130,7 +130,7 @@ class SerialLink(Link):
         return self._port
 
     def set_dtr(self, on: bool) -> None:
-        """Set the data-terminal-ready line, if there is one."""
+        """Set the data-terminal-prepare line, if there is one."""
         if self._serial is None:
             return
         try:
@@ -155,14 +155,14 @@ class SerialLink(Link):
             raise LinkProblem(describe_missing(self._port))
         if self._port != AUTO:
             self.path = paths[0]
-            return ready(open_port(self.path, self.baud))
+            return prepare(open_port(self.path, self.baud))
         for self.path in paths:
             if port := self._probed(self.path):
-                return ready(port)
+                return prepare(port)
         raise LinkProblem(f"none of {', '.join(paths)} answers like this device")
 
     def _probed(self, path: str) -> serial.Serial | None:
-        """Return the port if it is the right one; leave others as they were."""
+        """Open a port; return it if it is the right one, else close it."""
         try:
             port = open_port(path, self.baud)
         except LinkProblem:
@@ -170,7 +170,7 @@ class SerialLink(Link):
         found = False
         try:
             found = self._probe is not None and self._probe(port)
-        except (OSError, termios.error):  # it is gone, or not a terminal
+        except (OSError, termios.error):  # unplugged, or not a terminal
             pass
         finally:
             if not found:
@@ -180,7 +180,7 @@ class SerialLink(Link):
     def _shut(self) -> None:
         if self._serial:
             with contextlib.suppress(OSError, termios.error):
-                termios.tcflush(self._serial.fileno(), termios.TCIOFLUSH)  # else closing waits
+                termios.tcflush(self._serial.fileno(), termios.TCIOFLUSH)  # or closing would wait
             with contextlib.suppress(OSError):
                 self._serial.close()
             self._serial = None
@@ -192,7 +192,7 @@ class SerialLink(Link):
 
 
 def open_port(path: str, baud: int) -> serial.Serial:
-    """Open a serial port exclusively. Raises LinkProblem with what to do about it."""
+    """Open a serial port exclusively. Raises LinkProblem."""
     if not Path(path).exists():
         raise LinkProblem(describe_missing(path))
     try:
@@ -203,16 +203,16 @@ def open_port(path: str, baud: int) -> serial.Serial:
         raise LinkProblem(f"{path}: {error}") from None
 
 
-def ready(port: serial.Serial) -> serial.Serial:
-    """Prepare an open port for the event loop: empty its buffers; unplugging will end a read.
+def prepare(port: serial.Serial) -> serial.Serial:
+    """Prepare an open port for the event loop: empty its buffers, and let unplugging end a read.
 
-    Raises LinkProblem, with the port closed.
+    Closes the port before it raises LinkProblem.
     """
     try:
         fd = port.fileno()
         os.set_blocking(fd, False)
         settings = termios.tcgetattr(fd)
-        settings[6][termios.VMIN] = 1  # with 0, both no data and no device would read as b""
+        settings[6][termios.VMIN] = 1  # with 0, no data and no device would both read as b""
         termios.tcsetattr(fd, termios.TCSANOW, settings)
         termios.tcflush(fd, termios.TCIOFLUSH)
     except (OSError, termios.error) as error:

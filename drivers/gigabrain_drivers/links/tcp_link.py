@@ -14,16 +14,16 @@ from gigabrain_zenoh.clock import Clock
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.host.files import read_bounded
 
-CONNECT_TIMEOUT_S = 1.0  # shared equally by all addresses of a name
-QUIET_NS = 200_000_000  # a frozen peer's kernel still acknowledges: only bytes prove it alive
-LINGER_DISCARD = struct.pack("ii", 1, 0)  # linger on, for 0 s: unsent bytes are dropped
-MAX_ADDRESS_BYTES = 256  # size of a file with an address
+CONNECT_TIMEOUT_S = 1.0  # divided by the number of addresses of a host name
+QUIET_NS = 200_000_000  # only bytes prove a peer alive: the kernel acknowledges for a frozen one
+LINGER_DISCARD = struct.pack("ii", 1, 0)  # linger for 0 s: unsent bytes are dropped
+MAX_ADDRESS_BYTES = 256  # in a file with an address
 
 AddressInfo = tuple[socket.AddressFamily, socket.SocketKind, int, str, Any]  # from getaddrinfo
 
 
 class TcpLink(Link):
-    """A TCP connection. It is dropped after `quiet_ns` without bytes of the peer."""
+    """A TCP connection. It is dropped after `quiet_ns` without bytes from the peer."""
 
     def __init__(
         self, host: str, port: int, clock: Clock, *, quiet_ns: int | None = QUIET_NS
@@ -40,7 +40,7 @@ class TcpLink(Link):
         try:
             async with asyncio.timeout(CONNECT_TIMEOUT_S):
                 found = await loop.getaddrinfo(self._host, self._port, type=socket.SOCK_STREAM)
-                self._socket = await _connected(found, CONNECT_TIMEOUT_S / len(found))
+                self._socket = await _first_connected(found, CONNECT_TIMEOUT_S / len(found))
         except TimeoutError:
             raise LinkProblem(f"no answer from {self}: is it switched on?") from None
         except (socket.gaierror, UnicodeError) as error:
@@ -64,9 +64,9 @@ class TcpLink(Link):
 
 
 class AddressLink(TcpLink):
-    """A TCP connection to `HOST:PORT`, or to the address in a file, read for each connection.
+    """A TCP connection to `HOST:PORT`, or to the address in a file.
 
-    After a restart, an emulator may use another port.
+    The file is read for each connection, because an emulator may use another port after a restart.
     """
 
     def __init__(self, where: str, clock: Clock) -> None:
@@ -80,27 +80,27 @@ class AddressLink(TcpLink):
 
     async def _connect(self) -> int:
         if "/" in self._where:
-            self._host, self._port = written(Path(self._where))
+            self._host, self._port = read_address(Path(self._where))
         return await super()._connect()
 
 
-async def _connected(found: Sequence[AddressInfo], within_s: float) -> socket.socket:
+async def _first_connected(found: Sequence[AddressInfo], within_s: float) -> socket.socket:
     """Return a socket connected to the first address that answers. Raises OSError."""
     loop, problem = asyncio.get_running_loop(), OSError(errno.EADDRNOTAVAIL, "no address")
     for family, kind, protocol, _, where in found:
-        tried = socket.socket(family, kind, protocol)
-        tried.setblocking(False)
+        candidate = socket.socket(family, kind, protocol)
+        candidate.setblocking(False)
         try:
             async with asyncio.timeout(within_s):
-                await loop.sock_connect(tried, where)
+                await loop.sock_connect(candidate, where)
         except OSError as error:  # includes timeouts
-            tried.close()
+            candidate.close()
             problem = error
         except asyncio.CancelledError:
-            tried.close()
+            candidate.close()
             raise
         else:
-            return tried
+            return candidate
     raise problem
 
 
@@ -112,8 +112,8 @@ def address(text: str) -> tuple[str, int]:
     return host.strip("[]"), int(port)
 
 
-def written(path: Path) -> tuple[str, int]:
-    """Read (host, port) from a file. Raises LinkProblem."""
+def read_address(path: Path) -> tuple[str, int]:
+    """Return (host, port) from a file. Raises LinkProblem."""
     try:
         return address(read_bounded(path, MAX_ADDRESS_BYTES).decode("ascii"))
     except OSError:

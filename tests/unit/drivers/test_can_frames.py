@@ -1,4 +1,4 @@
-"""CAN frames as bytes, names of CAN interfaces, and what is said where one cannot be used."""
+"""CAN frames as bytes, and names of CAN interfaces, with texts if one cannot be used."""
 
 from pathlib import Path
 
@@ -19,12 +19,12 @@ from gigabrain_drivers.links.link import LinkProblem
 FRAMES = [CanFrame(0x155, bytes(range(8))), CanFrame(0x7FF, b""), CanFrame(1, b"\x01\x02")]
 
 
-def test_frames_travel_as_linux_has_them() -> None:
+def test_records_have_the_layout_of_linux() -> None:
     assert records(FRAMES[:1]).hex() == "5501000008000000" + "0001020304050607"
     assert CanDecoder().feed(records(FRAMES)) == FRAMES
 
 
-def test_records_that_are_no_frames_are_counted_and_forgotten() -> None:
+def test_invalid_records_are_counted_and_dropped() -> None:
     decoder = CanDecoder()
     extended, long = CanFrame(0x800, b""), bytearray(CanFrame(0x100, bytes(8)).record())
     long[4] = 9
@@ -35,7 +35,7 @@ def test_records_that_are_no_frames_are_counted_and_forgotten() -> None:
     assert decoder.feed(records(FRAMES)) == FRAMES
 
 
-def test_a_log_shows_frames_as_candump_does() -> None:
+def test_frames_are_logged_in_the_format_of_candump() -> None:
     spelling = CanSpelling(lambda frame: f"{len(frame.data)} bytes")
     assert spelling.spell(records(FRAMES)) == [
         "155#0001020304050607  8 bytes",
@@ -45,7 +45,7 @@ def test_a_log_shows_frames_as_candump_does() -> None:
 
 
 @pytest.mark.parametrize("port", ["can0", "slcan_1", "/run/ports/base", "ports/base"])
-def test_names_of_interfaces_and_paths_are_ports(port: str) -> None:
+def test_names_of_interfaces_and_paths_are_valid_ports(port: str) -> None:
     check_can_port(port)
 
 
@@ -61,7 +61,7 @@ def interface(folder: Path, name: str, kind: int, flags: int) -> None:
     (folder / name / "flags").write_text(f"{flags:#x}\n", encoding="ascii")
 
 
-def test_an_interface_that_cannot_be_used_has_one_clear_line(tmp_path: Path) -> None:
+def test_an_interface_that_cannot_be_used_is_described_in_one_line(tmp_path: Path) -> None:
     assert describe_interface("can0", tmp_path) == (
         "no CAN interface can0: is the adapter plugged in?"
     )
@@ -80,7 +80,7 @@ def test_an_interface_that_cannot_be_used_has_one_clear_line(tmp_path: Path) -> 
     assert describe_interface("can2", tmp_path) == ""
 
 
-def test_a_file_names_a_bus_of_an_emulator(tmp_path: Path) -> None:
+def test_a_file_names_the_bus_of_an_emulator(tmp_path: Path) -> None:
     path = tmp_path / "base"
     with pytest.raises(LinkProblem, match="is the emulator running"):
         read_address(path)

@@ -1,4 +1,4 @@
-"""The process that stops motors over a serial line when their driver has died or hangs."""
+"""The process that stops motors over a serial line when their driver dies or hangs."""
 
 import os
 import pty
@@ -19,7 +19,7 @@ def state() -> GuardState:
     return GuardState(150 * MS, 1000 * MS)
 
 
-def test_zero_is_sent_when_a_moving_driver_falls_silent() -> None:
+def test_motors_are_stopped_when_the_driver_falls_silent_while_they_move() -> None:
     guard = state()
     guard.take(b"0m", 0)
     assert not guard.stops(149 * MS)
@@ -33,7 +33,7 @@ def test_zero_is_sent_when_a_moving_driver_falls_silent() -> None:
     assert not guard.stops(9000 * MS)
 
 
-def test_it_stops_the_motors_at_once_when_the_driver_is_gone_and_then_ends() -> None:
+def test_motors_are_stopped_at_once_when_the_driver_ends() -> None:
     guard = state()
     guard.take(b"m", 0)
     guard.take(b"", MS)
@@ -43,7 +43,7 @@ def test_it_stops_the_motors_at_once_when_the_driver_is_gone_and_then_ends() -> 
 
 
 @pytest.mark.parametrize("words", [b"0", b"mq"])
-def test_it_leaves_motors_that_stand_or_were_let_go_alone(words: bytes) -> None:
+def test_motors_at_rest_or_of_a_driver_that_quits_are_not_stopped(words: bytes) -> None:
     guard = state()
     guard.take(words, 0)
     guard.take(b"", MS)
@@ -53,14 +53,14 @@ def test_it_leaves_motors_that_stand_or_were_let_go_alone(words: bytes) -> None:
 
 @pytest.fixture
 def line() -> Iterator[tuple[int, int]]:
-    """Both ends of a serial line: the motors' and the driver's."""
+    """Yield both ends of a serial line: the motors', and the driver's."""
     motors, driver = pty.openpty()
     yield motors, driver
     os.close(motors)
     os.close(driver)
 
 
-def test_a_silent_driver_of_moving_motors_has_them_stopped(line: tuple[int, int]) -> None:
+def test_the_process_stops_motors_of_a_silent_driver(line: tuple[int, int]) -> None:
     motors, driver = line
     guard = LineGuard(FRAME)
     guard.tell(driver, moving=True)
@@ -68,7 +68,7 @@ def test_a_silent_driver_of_moving_motors_has_them_stopped(line: tuple[int, int]
     guard.close()
 
 
-def test_a_guard_that_was_killed_is_replaced(line: tuple[int, int]) -> None:
+def test_a_killed_guard_is_restarted(line: tuple[int, int]) -> None:
     motors, driver = line
     guard = LineGuard(FRAME)
     guard.tell(driver, moving=False)
@@ -80,7 +80,7 @@ def test_a_guard_that_was_killed_is_replaced(line: tuple[int, int]) -> None:
     guard.close()
 
 
-def test_without_a_line_there_is_nothing_to_guard(line: tuple[int, int]) -> None:
+def test_there_is_no_guard_without_a_line(line: tuple[int, int]) -> None:
     guard = LineGuard(FRAME)
     guard.tell(None, moving=True)
     assert guard.pid is None
@@ -94,7 +94,7 @@ def test_without_a_line_there_is_nothing_to_guard(line: tuple[int, int]) -> None
     ("last_words", "stopped"),
     [("os._exit(1)", True), ("guard.close()", False)],
 )
-def test_motors_are_stopped_after_a_driver_that_dies_and_not_after_one_that_ends(
+def test_motors_are_stopped_if_the_driver_dies_but_not_if_it_closes_the_guard(
     line: tuple[int, int], last_words: str, stopped: bool
 ) -> None:
     motors, driver = line

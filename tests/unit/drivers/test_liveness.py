@@ -1,4 +1,4 @@
-"""A body that reports by itself is heard or not, and what is wrong is said once."""
+"""Watching a body that reports by itself: it is alive or lost, and each change is logged once."""
 
 import logging
 
@@ -13,7 +13,7 @@ LOG = logging.getLogger("body")
 
 
 class Body:
-    """Something on a port that is not there, with time by hand."""
+    """A body on an open port that does not exist, with a fake clock."""
 
     def __init__(self, port: str = "usb:0483:5740") -> None:
         self.clock = FakeClock()
@@ -26,7 +26,7 @@ class Body:
         return self.liveness.alive()
 
 
-async def test_it_is_alive_for_as_long_as_its_word_is_fresh() -> None:
+async def test_a_body_is_alive_while_its_newest_message_is_fresh() -> None:
     body = Body()
     assert not await body.alive_after(0)
     assert body.liveness.mark_received()
@@ -40,7 +40,7 @@ async def test_it_is_alive_for_as_long_as_its_word_is_fresh() -> None:
     assert not body.liveness.received
 
 
-async def test_a_line_that_opens_and_is_dropped_again_and_again_is_reported_once(
+async def test_a_line_that_is_dropped_repeatedly_is_logged_once(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     body = Body()
@@ -50,7 +50,7 @@ async def test_a_line_that_opens_and_is_dropped_again_and_again_is_reported_once
     assert [record.message for record in caplog.records] == ["usb:0483:5740: it talks nonsense"]
 
 
-async def test_what_the_line_says_is_not_prefixed_with_its_own_name(
+async def test_a_problem_that_names_the_line_has_no_prefix(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     body = Body()
@@ -59,7 +59,7 @@ async def test_what_the_line_says_is_not_prefixed_with_its_own_name(
     assert caplog.messages == ["no USB device usb:0483:5740: is it plugged in?"]
 
 
-async def test_the_end_of_a_silence_is_reported_as_well(caplog: pytest.LogCaptureFixture) -> None:
+async def test_the_end_of_a_silence_is_logged(caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level("INFO")
     body = Body("/dev/ttyUSB9")
     await body.alive_after(501)

@@ -1,4 +1,4 @@
-"""Frames on a line as text, each beside its own bytes, received in pieces of any size."""
+"""Frames as text for the log, each with its own bytes."""
 
 import logging
 import math
@@ -83,20 +83,20 @@ FRAMES: list[tuple[Callable[[bytes], Any], Callable[[Any], str], str, str]] = [
 
 
 @pytest.mark.parametrize(
-    ("feed", "words", "frame", "text"), FRAMES, ids=[f[3][:20] for f in FRAMES]
+    ("feed", "describe", "frame", "text"), FRAMES, ids=[f[3][:20] for f in FRAMES]
 )
-def test_a_frame_stands_beside_its_bytes(
-    feed: Callable[[bytes], Any], words: Callable[[Any], str], frame: str, text: str
+def test_a_frame_is_shown_with_its_bytes(
+    feed: Callable[[bytes], Any], describe: Callable[[Any], str], frame: str, text: str
 ) -> None:
-    spelling, data = Spelling(feed, words), bytes.fromhex(frame)
+    spelling, data = Spelling(feed, describe), bytes.fromhex(frame)
     assert spelling.spell(data[:3]) + spelling.spell(data[3:]) == [f"{frame}  {text}"]
     assert spelling.spell(data) == [f"{frame}  {text}"]
 
 
-def test_bytes_that_are_no_frame_are_shown_as_they_are() -> None:
+def test_bytes_without_a_frame_are_shown() -> None:
     spelling = Spelling(opencr.DynamixelDecoder().feed, opencr.describe)
-    told = spelling.spell(bytes(600))
-    assert [line[-8:] for line in told] == ["no frame"]
+    lines = spelling.spell(bytes(600))
+    assert [line[-8:] for line in lines] == ["no frame"]
     assert Wording().lines("tx", b"\x01\xff") == ["tx 01 ff"]
 
 
@@ -109,7 +109,7 @@ def test_a_command_is_reported_as_received_and_as_converted() -> None:
 
 
 @pytest.mark.long
-async def test_a_trace_shows_both_ways_and_leaves_the_log_as_it_was(tmp_path: Path) -> None:
+async def test_a_trace_shows_both_directions_and_restores_the_log(tmp_path: Path) -> None:
     before, lines = (links.log.level, list(links.log.handlers)), list[str]()
     await trace_line(
         "mycustombot",
@@ -151,17 +151,17 @@ async def test_a_real_body_is_not_moved_by_a_trace(tmp_path: Path) -> None:
         )
 
 
-async def test_a_trace_says_whether_anything_was_received(tmp_path: Path) -> None:
+async def test_a_trace_returns_whether_anything_was_received(tmp_path: Path) -> None:
     text = BARE.replace("{port}", str(tmp_path / "nothing"))
     (tmp_path / "robot.yaml").write_text(text)
-    name, said = str(tmp_path / "robot.yaml"), list[str]()
+    name, lines = str(tmp_path / "robot.yaml"), list[str]()
     received = await trace_line(
-        name, "real", tmp_path, part="base", seconds=0.1, wanted=Velocity(), print_line=said.append
+        name, "real", tmp_path, part="base", seconds=0.1, wanted=Velocity(), print_line=lines.append
     )
     assert not received
 
 
-async def test_a_lidar_that_a_body_does_not_have_is_not_traced(tmp_path: Path) -> None:
+async def test_a_trace_of_a_lidar_that_the_body_lacks_is_refused(tmp_path: Path) -> None:
     text = BARE.replace("{port}", str(tmp_path / "nothing"))
     (tmp_path / "robot.yaml").write_text(text)
     name = str(tmp_path / "robot.yaml")
@@ -179,12 +179,14 @@ async def test_a_lidar_that_a_body_does_not_have_is_not_traced(tmp_path: Path) -
         ({"seconds": 1e9}, r"--seconds: expected a number below 1e\+09, got 1e\+09"),
     ],
 )
-def test_a_trace_for_no_time_is_refused(options: dict[str, float], complaint: str) -> None:
+def test_a_trace_with_an_invalid_duration_is_refused(
+    options: dict[str, float], complaint: str
+) -> None:
     with pytest.raises(ConfigError, match=complaint):
         trace("mycustombot", **options)  # type: ignore[arg-type]
 
 
-def test_the_kit_tells_in_one_line_what_it_has_broken_on_purpose(
+def test_the_kit_summarises_expected_warnings_in_one_line(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     async def check(*_: object) -> list[object]:

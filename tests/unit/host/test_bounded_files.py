@@ -17,7 +17,7 @@ from gigabrain_drivers.driver.catalog import load_robot
 from gigabrain_drivers.driver.gatekeeper import UNREADABLE, LatchFile
 from gigabrain_drivers.driver.robot import Run
 from gigabrain_drivers.links.link import LinkProblem
-from gigabrain_drivers.links.tcp_link import written
+from gigabrain_drivers.links.tcp_link import read_address
 from gigabrain_drivers.sim.body import MujocoOptions, sim_body
 from gigabrain_zenoh.config import loading as config
 from gigabrain_zenoh.config.loading import located
@@ -314,7 +314,7 @@ def test_an_address_in_no_plain_file_is_a_problem_of_the_link(
 ) -> None:
     make(tmp_path / "port")
     with pytest.raises(LinkProblem, match="does not hold HOST:PORT"):
-        written(tmp_path / "port")
+        read_address(tmp_path / "port")
 
 
 def test_a_folder_without_logs_is_said_to_hold_none(tmp_path: Path) -> None:
