@@ -1,4 +1,4 @@
-"""Alpha's frames: literal bytes, both ways, and whatever else may come down a line."""
+"""Alpha's frames: literal bytes, round trips, and damaged or hostile bytes."""
 
 import math
 import random
@@ -16,7 +16,7 @@ from gigabrain_drivers.kinematics.wheels import Twist
 from gigabrain_drivers.links.tcp_link import address
 from gigabrain_zenoh.errors import ConfigError
 
-# the vectors of docs/reference/firmware_alpha.md
+# the examples of docs/reference/firmware_alpha.md
 STOP_1 = bytes.fromhex("a55a0000020101000000d58d9383")
 WALK_2 = bytes.fromhex(
     "a55a2c00010102000000e8030000cdcccc3d000000000000000066666640"
@@ -55,7 +55,7 @@ def a_state(**changes: object) -> State:
     return state._replace(**changes)
 
 
-def test_the_vectors_of_the_firmware_page() -> None:
+def test_the_examples_of_the_firmware_page() -> None:
     assert alpha.encode_stop(1) == STOP_1
     assert alpha.encode_walk(Walk(1000, FORWARD), 2) == WALK_2
     frames = AlphaDecoder().feed(STOP_1 + WALK_2)
@@ -66,13 +66,13 @@ def test_the_vectors_of_the_firmware_page() -> None:
     assert command.gait[:3] == pytest.approx((0.1, 0.0, 0.0))
 
 
-def test_crc_and_lengths_are_those_of_the_firmware_page() -> None:
+def test_crc_and_lengths_match_the_firmware_page() -> None:
     assert zlib.crc32(b"123456789") == 0xCBF43926
     assert len(alpha.encode_state(a_state(), 1)) == 248
     assert alpha.encode_state(a_state(), 0x01020304)[:10] == bytes.fromhex("a55aea00810104030201")
 
 
-def test_each_number_of_a_state_is_where_the_firmware_page_says() -> None:
+def test_the_layout_of_a_state_matches_the_firmware_page() -> None:
     data = alpha.encode_state(a_state(), 5)
     assert struct.unpack_from("<III", data, 10) == (1000, 7, 3)
     assert (data[22], data[23]) == (1, 0b1001)
@@ -87,14 +87,14 @@ def test_each_number_of_a_state_is_where_the_firmware_page_says() -> None:
 
 
 @given(gaits, st.integers(0, 2**32 - 1), st.integers(0, 2**32 - 1))
-def test_a_command_there_and_back(gait: Gait, seen: int, sequence: int) -> None:
+def test_command_round_trip(gait: Gait, seen: int, sequence: int) -> None:
     (frame,) = AlphaDecoder().feed(alpha.encode_walk(Walk(seen, gait), sequence))
     assert frame.sequence == sequence
     assert alpha.decode_walk(frame) == Walk(seen, gait)
 
 
 @given(st.floats(-0.5, 0.5), st.floats(-0.2, 0.2), st.floats(-1, 1))
-def test_a_velocity_survives_the_wire_to_a_millionth(x: float, y: float, turn: float) -> None:
+def test_velocity_round_trip_to_a_millionth(x: float, y: float, turn: float) -> None:
     (frame,) = AlphaDecoder().feed(alpha.encode_walk(Walk(0, WALKER.to_gait(Twist(x, y, turn))), 1))
     command = alpha.decode_walk(frame)
     assert command
@@ -102,7 +102,7 @@ def test_a_velocity_survives_the_wire_to_a_millionth(x: float, y: float, turn: f
 
 
 @pytest.mark.parametrize(
-    ("limits", "sound"),
+    ("limits", "valid"),
     [
         ({"height": 0.33, "turn": 0.6, "frequency": 5.0, "duty": 0.9}, True),
         ({"height": 0.2, "turn": -0.6, "frequency": 1.0, "duty": 0.5}, True),
@@ -112,23 +112,23 @@ def test_a_velocity_survives_the_wire_to_a_millionth(x: float, y: float, turn: f
         ({"stride_x": 0.25001}, False),
     ],
 )
-def test_the_limits_of_the_firmware_page_are_obeyed_though_the_wire_rounds_them(
-    limits: dict[str, float], sound: bool
+def test_limits_are_valid_although_the_wire_rounds_them(
+    limits: dict[str, float], valid: bool
 ) -> None:
     gait = WALKER.to_gait(Twist(0.0, 0.0, 0.0))._replace(**limits)
     (frame,) = AlphaDecoder().feed(alpha.encode_walk(Walk(1000, gait), 2))
     walk = alpha.decode_walk(frame)
     assert walk
-    assert is_valid_gait(walk.gait) == sound
+    assert is_valid_gait(walk.gait) == valid
 
 
-def test_a_state_there_and_back() -> None:
+def test_state_round_trip() -> None:
     (frame,) = AlphaDecoder().feed(alpha.encode_state(a_state(), 9))
     assert alpha.decode_state(frame) == a_state()
 
 
 @given(st.lists(st.integers(1, 60), max_size=40))
-def test_frames_are_found_however_they_are_cut(cuts: list[int]) -> None:
+def test_frames_are_found_in_pieces_of_any_size(cuts: list[int]) -> None:
     stream = (
         alpha.encode_stop(1)
         + alpha.encode_walk(Walk(0, FORWARD), 2)
@@ -144,7 +144,7 @@ def test_frames_are_found_however_they_are_cut(cuts: list[int]) -> None:
 
 
 @given(st.binary(max_size=400))
-def test_no_bytes_make_the_decoder_raise_or_keep_more_than_a_frame(noise: bytes) -> None:
+def test_the_decoder_never_raises_and_keeps_at_most_one_frame(noise: bytes) -> None:
     decoder = AlphaDecoder()
     decoder.feed(noise)
     decoder.feed(b"\x00" * 300)
@@ -153,18 +153,18 @@ def test_no_bytes_make_the_decoder_raise_or_keep_more_than_a_frame(noise: bytes)
 
 
 @given(st.binary(min_size=44, max_size=44))
-def test_no_payload_makes_a_command_raise(payload: bytes) -> None:
+def test_decoding_a_command_never_raises(payload: bytes) -> None:
     command = alpha.decode_walk(AlphaFrame(alpha.WALK, 1, payload))
     assert command is None or all(map(math.isfinite, command.gait.phases))
 
 
 @given(st.binary(min_size=234, max_size=234))
-def test_no_payload_makes_a_state_raise(payload: bytes) -> None:
+def test_decoding_a_state_never_raises(payload: bytes) -> None:
     state = alpha.decode_state(AlphaFrame(alpha.STATE, 1, payload))
     assert state is None or 0.99 < math.hypot(*state.senses.orientation) < 1.01
 
 
-def test_a_broken_frame_costs_no_more_than_itself() -> None:
+def test_a_damaged_frame_loses_no_other_frame() -> None:
     broken = bytearray(WALK_2)
     broken[20] ^= 1
     decoder = AlphaDecoder()
@@ -172,19 +172,19 @@ def test_a_broken_frame_costs_no_more_than_itself() -> None:
     assert decoder.errors == 1
 
 
-def test_a_length_that_does_not_belong_to_its_type_is_not_waited_for() -> None:
+def test_a_length_that_does_not_fit_the_type_is_refused_at_once() -> None:
     wrong = bytearray(WALK_2)
     wrong[2:4] = b"\xff\xff"
     assert [f.sequence for f in AlphaDecoder().feed(bytes(wrong) + STOP_1)] == [1]
 
 
-def test_another_version_is_not_obeyed() -> None:
+def test_a_frame_of_another_version_is_refused() -> None:
     other = bytearray(STOP_1[:-4])
     other[5] = 2
     assert AlphaDecoder().feed(bytes(other) + struct.pack("<I", zlib.crc32(other))) == []
 
 
-def test_what_is_not_a_number_is_no_command_and_no_state() -> None:
+def test_commands_and_states_with_nan_or_infinity_are_refused() -> None:
     walk = alpha.encode_walk(Walk(0, FORWARD._replace(turn=math.nan)), 1)
     assert alpha.decode_walk(AlphaDecoder().feed(walk)[0]) is None
     state = alpha.encode_state(a_state(voltage=math.inf), 1)
@@ -198,11 +198,11 @@ def test_sequences_and_times_wrap() -> None:
     assert not alpha.is_newer(2**32 - 1, 3)
     assert not alpha.is_stale(2**32 - 50, 100)
     assert alpha.is_stale(2**32 - 50, 101)
-    assert alpha.is_stale(100, 99)  # from the future: from another start of the firmware
+    assert alpha.is_stale(100, 99)  # in the future: before a restart of the firmware
 
 
-@pytest.mark.parametrize(("rate", "least"), [(0.001, 0.9), (0.05, 0.03)])
-def test_byte_errors_make_no_wrong_command(rate: float, least: float) -> None:
+@pytest.mark.parametrize(("rate", "min_share"), [(0.001, 0.9), (0.05, 0.03)])
+def test_byte_errors_never_change_a_command(rate: float, min_share: float) -> None:
     noise, count = random.Random(1), 20_000
     decoder, right = AlphaDecoder(), 0
     for sequence in range(count):
@@ -216,11 +216,11 @@ def test_byte_errors_make_no_wrong_command(rate: float, least: float) -> None:
             assert command
             assert frame.sequence == command.seen == command.gait.stride_x
             right += 1
-    assert right > least * count
+    assert right > min_share * count
 
 
 @pytest.mark.parametrize("wrong", ["nowhere", "host:", ":8080", "host:99999", "host:80a"])
-def test_an_address_that_is_none_is_refused(wrong: str) -> None:
+def test_an_invalid_address_is_refused(wrong: str) -> None:
     with pytest.raises(ConfigError, match="expected HOST:PORT"):
         address(wrong)
 

@@ -1,4 +1,4 @@
-"""Alpha on its real link: a quadruped on TCP that gets a gait fifty times a second.
+"""Driver of alpha, a quadruped on TCP that receives a gait fifty times a second.
 
 The driver sends only commands that it receives. When they end, the firmware stops the body 100 ms
 later (docs/reference/firmware_alpha.md).
@@ -38,19 +38,19 @@ log = logging.getLogger(__name__)
 
 NO_VALID_FRAME = "no valid frame comes: is this the right port?"
 STATE_TIMEOUT_NS = 100_000_000  # the body counts as lost after this time without a state
-FLUSH_NS = 10_000_000  # for the last command to arrive before the connection closes
-CLOCK_WRAP_MS = 1 << 32  # of the firmware's clock
+FLUSH_NS = 10_000_000  # pause for the last command, before the connection closes
+CLOCK_WRAP_MS = 1 << 32  # the firmware's clock wraps here
 USUAL_ROUND_TRIP_MS = 30.0  # from a command to the state that echoes it
 
 
 class AlphaOptions(LinkOptions, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """The quadruped's part of a robot's file."""
 
-    port: str = f"192.168.123.10:{alpha.PORT}"  # HOST:PORT, or a file that holds it
+    port: str = f"192.168.123.10:{alpha.PORT}"  # HOST:PORT, or a file with it
 
 
 class AlphaDriver(Driver):
-    """Sends nothing until the body reports. Its first command is a stop, also after a loss."""
+    """Sends nothing before the body reports. Its first command is a stop, also after a loss."""
 
     Options = AlphaOptions
 
@@ -71,14 +71,14 @@ class AlphaDriver(Driver):
         self._state: State | None = None
         self._liveness = Liveness(self.link, self._clock, STATE_TIMEOUT_NS, NO_VALID_FRAME, log)
         self._stamps, self._echoes = DeviceClock(CLOCK_WRAP_MS), EchoClock(USUAL_ROUND_TRIP_MS)
-        self._unreported = False  # a loss was not reported yet
+        self._unreported_loss = False  # True after a loss, until `read_state` reports it
         self._open = self._parked = False
         self._fall = Fault(log)
         self.sensors = dict.fromkeys(("imu", "scan") if options.scan else ("imu",))
         self._lidar: ScanSource | None = None
 
     async def open(self) -> None:
-        """Start connecting to the body and its lidar; both may appear later."""
+        """Start to connect to the body and its lidar, which may appear later."""
         self._open = True
         self.link.open()
         self._lidar = open_lidar(self, self._clock)
@@ -95,17 +95,17 @@ class AlphaDriver(Driver):
             await self._lidar.close()
 
     async def stop(self) -> None:
-        """Come to rest and stand; a body that lies stays down."""
+        """Come to rest and stand; a lying body stays down."""
         if self._liveness.received:
             encode = alpha.encode_park if self._parked else alpha.encode_stop
-            self.link.write(encode(self._next()))
+            self.link.write(encode(self._next_sequence()))
 
     async def park(self) -> None:
         """Lie down. Only a command to walk makes it stand up."""
         if not self._liveness.received:
             raise BodyLost(f"{self.link}: {self.link.problem or 'the body is silent'}")
         self._parked = True
-        self.link.write(alpha.encode_park(self._next()))
+        self.link.write(alpha.encode_park(self._next_sequence()))
 
     async def set_base_velocity(
         self, linear_x: float, linear_y: float, angular_z: float
@@ -115,21 +115,21 @@ class AlphaDriver(Driver):
             raise BodyLost("the connection is not open")
         if not self._liveness.received:  # the firmware may still be starting
             return ZERO
-        to = self.bounded(linear_x, linear_y, angular_z)
-        if self._unreported or self._fallen:
-            to = ZERO
-        if self._parked and to == ZERO:
-            self.link.write(alpha.encode_park(self._next()))
+        target = self.bounded(linear_x, linear_y, angular_z)
+        if self._unreported_loss or self._fallen:
+            target = ZERO
+        if self._parked and target == ZERO:
+            self.link.write(alpha.encode_park(self._next_sequence()))
             return ZERO
         self._parked = False
-        gait = WALKER.to_gait(Twist(to.linear_x, to.linear_y, to.angular_z))
-        seen = self._last[1] if self._last else 0
-        if not self.link.write(alpha.encode_walk(alpha.Walk(seen, gait), self._next())):
+        gait = WALKER.to_gait(Twist(target.linear_x, target.linear_y, target.angular_z))
+        seen_ms = self._last[1] if self._last else 0
+        if not self.link.write(alpha.encode_walk(alpha.Walk(seen_ms, gait), self._next_sequence())):
             return ZERO
         return Velocity(**WALKER.to_body(gait)._asdict())
 
     async def read_state(self) -> RobotState:
-        """Return the body's newest report; its `link` shows whether it is recent."""
+        """Return the body's newest report; `link.connected` is False if it is too old."""
         velocity = self._odometry.velocity if self._liveness.received else Twist(0.0, 0.0, 0.0)
         state = RobotState(
             robot_type=self.robot.robot_type,
@@ -137,13 +137,13 @@ class AlphaDriver(Driver):
             velocity=Velocity(**velocity._asdict()),
             link=self._health(),
         )
-        return _with(state, self._state) if self._state else state
+        return _with_report(state, self._state) if self._state else state
 
     @property
     def _fallen(self) -> bool:
         return self._state is not None and bool(self._state.flags & alpha.FALLEN)
 
-    def _next(self) -> int:
+    def _next_sequence(self) -> int:
         self._sequence = (self._sequence + 1) % alpha.SEQUENCES
         self._echoes.sent(self._sequence, self._clock.now_ns())
         return self._sequence
@@ -155,7 +155,7 @@ class AlphaDriver(Driver):
         self._last = None
 
     def _lost(self, why: str) -> None:
-        self._unreported = self._unreported or self._liveness.received
+        self._unreported_loss = self._unreported_loss or self._liveness.received
         self._liveness.reset()
 
     def _received(self, data: bytes) -> None:
@@ -164,10 +164,10 @@ class AlphaDriver(Driver):
             if state is None:
                 self._invalid_frames += 1
             else:
-                self._take(frame, state)
+                self._handle_state(frame, state)
         self.link.errors = self._decoder.errors + self._invalid_frames
 
-    def _take(self, frame: AlphaFrame, state: State) -> None:
+    def _handle_state(self, frame: AlphaFrame, state: State) -> None:
         """Handle one report. The firmware's clock gives the time since the last one."""
         last, self._last = self._last, (frame.sequence, state.milliseconds)
         if last and not alpha.is_newer(frame.sequence, last[0]):
@@ -181,10 +181,10 @@ class AlphaDriver(Driver):
         if last:
             passed = (state.milliseconds - last[1]) % CLOCK_WRAP_MS
             self._odometry.update(state.senses, passed / 1000)
-        if first:  # a body that lies stays down until a command to walk
+        if first:  # a lying body stays down until a command to walk
             self._parked = bool(state.flags & alpha.PARKED)
             encode = alpha.encode_park if self._parked else alpha.encode_stop
-            self.link.write(encode(self._next()))
+            self.link.write(encode(self._next_sequence()))
         senses = state.senses
         imu = Imu(
             orientation=senses.orientation,
@@ -198,26 +198,26 @@ class AlphaDriver(Driver):
             self._fall.end("the body stands again")
 
     def _health(self) -> LinkHealth:
-        """Return the connection's health; connected means that reports come.
+        """Return the connection's health; `connected` means that reports arrive.
 
         A loss is reported at least once, even if the body is back at once.
         """
         alive = self._liveness.alive()
-        reported, self._unreported = not self._unreported, False
+        reported, self._unreported_loss = not self._unreported_loss, False
         late_ms = max(self._stamps.late_ms, self._echoes.late_ms)
         return replace(self.link.health, connected=alive and reported, late_ms=late_ms)
 
 
-def _with(state: RobotState, now: State) -> RobotState:
+def _with_report(state: RobotState, now: State) -> RobotState:
     """Return `state` with the values of the body's report."""
     senses = now.senses
     positions, rates = by_joint(senses.joints), by_joint(senses.rates)
-    each = zip(JOINT_NAMES, positions, rates, now.torques, now.temperatures, strict=True)
+    joints = zip(JOINT_NAMES, positions, rates, now.torques, now.temperatures, strict=True)
     return replace(
         state,
         joints=tuple(
-            Joint(name=name, position=at, velocity=rate, effort=torque, temperature=celsius)
-            for name, at, rate, torque, celsius in each
+            Joint(name=name, position=position, velocity=rate, effort=torque, temperature=celsius)
+            for name, position, rate, torque, celsius in joints
         ),
         battery=Battery(voltage=now.voltage, percentage=now.percentage, current=now.current),
         imu=ImuData(

@@ -1,4 +1,4 @@
-"""Alpha's firmware, as in docs/reference/firmware_alpha.md: a TCP server, and a trot."""
+"""Emulated firmware of alpha, as in docs/reference/firmware_alpha.md: a TCP server, and a trot."""
 
 from collections import deque
 from pathlib import Path
@@ -16,14 +16,14 @@ LYING_M = 0.13  # height of the hips of a lying body
 REST = WALKER.to_gait(Twist(0.0, 0.0, 0.0))
 RISE_NS = 1_800_000_000  # from lying to standing
 LYING = REST._replace(height=LYING_M)
-BROWN_OUT_SHARE = 0.6  # of the battery's voltage; below it the firmware is off
-MAX_EXECUTED = 1000  # commands that are kept for tests
+BROWN_OUT_SHARE = 0.6  # of the battery's voltage; the firmware is off below it
+MAX_EXECUTED = 1000  # newest commands, kept for tests
 
 
 class Alpha(Device):
-    """Obeys valid commands newer than the last; stops by itself; reports each step of its body.
+    """Obeys valid commands that are newer than the last one, stops after silence, and reports.
 
-    After silence the first valid command starts a new sequence.
+    After silence, the first valid command starts a new sequence.
     """
 
     Options = AlphaOptions
@@ -38,7 +38,7 @@ class Alpha(Device):
 
     @classmethod
     def port(cls, options: Any) -> Port:
-        """Return a TCP port, the usual one if free; the file in the options gets its address."""
+        """Return a TCP port: the default one, if free. Its address is written to `options.port`."""
         return TcpPort(Path(options.port), alpha.PORT)
 
     def reset(self) -> None:
@@ -51,12 +51,12 @@ class Alpha(Device):
         self.body.take_snapshots()  # drop old measurements
         self._began_ns = self.body.snapshot.time_ns
         self._silent, self._on = True, True
-        self._gait, self._up_ns = REST, 0
+        self._gait, self._stands_ns = REST, 0
         self.body.walk(REST)
 
     @property
     def parked(self) -> bool:
-        """True while it lies, or lies down."""
+        """True while the body lies, or is lying down."""
         return self._gait == LYING
 
     def feed(self, data: bytes) -> None:
@@ -73,7 +73,7 @@ class Alpha(Device):
         self._refused += self._decoder.errors - errors
 
     def step(self, now_ns: int) -> None:
-        """Watch the time since the last command, and report."""
+        """Stop the body after silence, and report."""
         supply = self.body.snapshot.battery.voltage
         on = supply - self.sag_volts >= BROWN_OUT_SHARE * supply
         if on != self._on:
@@ -104,7 +104,7 @@ class Alpha(Device):
         return None if alpha.is_stale(command.seen, now_ms) else command.gait
 
     def _milliseconds(self, sample: Snapshot) -> int:
-        """Return the firmware's clock [ms]. It is the body's: a busy host delays both."""
+        """Return the firmware's clock [ms]. It runs with the body's: a busy host delays both."""
         return max(0, sample.time_ns - self._began_ns) // 1_000_000
 
     def _execute(self, gait: Gait, sequence: int) -> None:
@@ -116,8 +116,8 @@ class Alpha(Device):
     def _walk(self, gait: Gait) -> None:
         """Command the legs; a lying body stands up before its first step."""
         if self.parked and gait != LYING:
-            self._up_ns = self._now_ns + RISE_NS
-        if gait != LYING and self._now_ns < self._up_ns:
+            self._stands_ns = self._now_ns + RISE_NS
+        if gait != LYING and self._now_ns < self._stands_ns:
             gait = REST
         if gait != self._gait:
             self._gait = gait

@@ -1,4 +1,4 @@
-"""Alpha's protocol: gaits to the body, states from it, in frames with a CRC-32.
+"""Protocol of alpha: gaits to the body, and states from it, in frames with a CRC-32.
 
 docs/reference/firmware_alpha.md describes it for firmware authors. Numbers are little-endian:
 
@@ -19,20 +19,20 @@ from gigabrain_drivers.links.frames import FrameDecoder
 
 PORT = 8080
 SILENCE_NS = 100_000_000  # the body stops after this time without a valid command
-STALE_MS = 150  # a command based on an older state is refused
+STALE_MS = 150  # a command that is based on an older state is refused
 STATE_HZ = 100
 MAGIC, VERSION = b"\xa5\x5a", 1
 WALK, STOP, PARK, STATE = 0x01, 0x02, 0x03, 0x81
 SEQUENCES = 1 << 32
 
-WALKING, SILENT, FALLEN, PARKED = 1, 2, 4, 8  # flags: steps; stopped by silence; fell; lies
+WALKING, SILENT, FALLEN, PARKED = 1, 2, 4, 8  # flags; SILENT: stopped after silence
 
 _HEADER = struct.Struct("<2sHBBI")
 _CRC = struct.Struct("<I")
 _GAIT = struct.Struct("<I10f")
 _STATE = struct.Struct("<III B B 3f 4f3f3f 36f 12h")
 _LENGTHS = {WALK: _GAIT.size, STOP: 0, PARK: 0, STATE: _STATE.size}
-_MAX_VALUE = 1e4  # larger absolute values in a state are no measurements
+_MAX_VALUE = 1e4  # larger absolute values in a state are invalid
 
 
 class AlphaFrame(NamedTuple):
@@ -46,7 +46,7 @@ class AlphaFrame(NamedTuple):
 class Walk(NamedTuple):
     """A command to walk."""
 
-    seen: int  # [ms], stamp of the newest state that the sender received
+    seen: int  # [ms], `milliseconds` of the newest state that the sender received
     gait: Gait
 
 
@@ -56,7 +56,7 @@ class State(NamedTuple):
     milliseconds: int  # since the start of the firmware, wraps
     echo: int  # sequence of the newest obeyed command; 0 for none
     refused: int  # number of frames without a valid command
-    flags: int
+    flags: int  # WALKING, SILENT, FALLEN, PARKED
     voltage: float  # [V]
     current: float  # [A], positive while it drains
     percentage: float  # [%]
@@ -74,7 +74,7 @@ def encode(frame: AlphaFrame) -> bytes:
 
 
 def encode_walk(command: Walk, sequence: int) -> bytes:
-    """A command to walk."""
+    """Return a command to walk."""
     seen, gait = command
     values = (gait.stride_x, gait.stride_y, gait.turn, gait.frequency, gait.duty)
     return encode(AlphaFrame(WALK, sequence, _GAIT.pack(seen, *values, *gait.phases, gait.height)))
@@ -99,16 +99,16 @@ def decode_walk(frame: AlphaFrame) -> Walk | None:
 
 
 def is_stale(seen: int, now: int) -> bool:
-    """Return whether a command's `seen` time [ms] is too old at `now`; handles the wrap."""
+    """Return whether a command's `seen` [ms] is too old at `now` [ms]; handles the wrap."""
     return (now - seen) % SEQUENCES > STALE_MS
 
 
 def encode_state(now: State, sequence: int) -> bytes:
-    """The body's report."""
+    """Return the body's report."""
     senses = now.senses
     feet = sum(1 << foot for foot, touches in enumerate(senses.contacts) if touches)
     joints, rates = by_joint(senses.joints), by_joint(senses.rates)
-    each = zip(joints, rates, now.torques, strict=True)
+    by_motor = zip(joints, rates, now.torques, strict=True)
     payload = _STATE.pack(
         now.milliseconds % SEQUENCES,
         now.echo,
@@ -121,7 +121,7 @@ def encode_state(now: State, sequence: int) -> bytes:
         *senses.orientation,
         *senses.angular_velocity,
         *senses.linear_acceleration,
-        *(value for joint in each for value in joint),
+        *(value for motor in by_motor for value in motor),
         *(max(-32768, min(32767, round(10 * value))) for value in now.temperatures),
     )
     return encode(AlphaFrame(STATE, sequence, payload))
@@ -196,8 +196,8 @@ class AlphaDecoder(FrameDecoder[AlphaFrame]):
         if len(buffer) < _HEADER.size:
             return None
         _, length, kind, version, _ = _HEADER.unpack_from(buffer)
-        right = version == VERSION and _LENGTHS.get(kind) == length
-        return _HEADER.size + int(length) + _CRC.size if right else 0
+        valid = version == VERSION and _LENGTHS.get(kind) == length
+        return _HEADER.size + int(length) + _CRC.size if valid else 0
 
     def _frame(self, data: bytes) -> AlphaFrame | None:
         body, (crc,) = data[: -_CRC.size], _CRC.unpack(data[-_CRC.size :])
