@@ -64,8 +64,8 @@ class ShuffledEnd(LocalTransport):
 class Roamer(MockBody):
     """The mock, in a room that stays where it is."""
 
-    def _look(self) -> LaserScan | None:
-        scan, here = super()._look(), self._pose
+    def _scan(self) -> LaserScan | None:
+        scan, here = super()._scan(), self._pose
         assert scan
         ranges = round_room(1.2, here.x, here.y, here.yaw) + self._noise.normal(0.0, 0.01, 360)
         return replace(scan, ranges=ranges_bytes(ranges))

@@ -17,7 +17,7 @@ from gigabrain_zenoh.clock import Clock
 from gigabrain_zenoh.errors import BodyLost
 from gigabrain_zenoh.geometry.limits import ZERO
 
-ROOM_M = 3.0  # distance to the round wall
+ROOM_RADIUS_M = 3.0
 
 
 class MockOptions(LinkOptions, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -27,7 +27,7 @@ class MockOptions(LinkOptions, frozen=True, kw_only=True, forbid_unknown_fields=
 
 
 class MockBody(Driver):
-    """Moves at the commanded speed at once. Its room moves with it."""
+    """Moves at the commanded speed at once. The room moves with it."""
 
     Options = MockOptions
 
@@ -39,19 +39,19 @@ class MockBody(Driver):
         self._velocity = ZERO
         self._pose = Pose(x=0.0, y=0.0, yaw=0.0)
         self._noise = np.random.default_rng(run.seed)
-        self._ticks = self._next_scan = 0
+        self._ticks = self._next_scan_tick = 0
         self.sensors = {"scan": None}
-        self._lidar: ScanSource | None = None  # a real one, if its link names one
+        self._lidar: ScanSource | None = None  # the real lidar, if the link names one
 
     async def open(self) -> None:
-        """Connect to a real lidar if it has one; otherwise take the first simulated scan."""
+        """Connect to the real lidar, if any; otherwise make the first simulated scan."""
         self._open = True
         self._lidar = open_lidar(self, Clock())
         if self._lidar is None:
-            self.sensors["scan"] = self._look()
+            self.sensors["scan"] = self._scan()
 
     async def close(self) -> None:
-        """Forget the connection."""
+        """Stop, and close the real lidar, if any."""
         self._open, self._velocity = False, ZERO
         lidar, self._lidar = self._lidar, None
         if lidar:
@@ -65,29 +65,29 @@ class MockBody(Driver):
         """Tick by the host's clock, or in lock-step as fast as the brain answers."""
         if self.lockstep:
             while True:
-                self._turn()
+                self._publish_scan()
                 self._advance()
                 yield 1
         async for passed in super().ticks(clock):
             for _ in range(passed):
                 self._advance()
             yield passed
-            await clock.sleep_ns(TICK_NS // 2)  # scans come between the body's states
-            self._turn()
+            await clock.sleep_ns(TICK_NS // 2)  # scans are published between the body's states
+            self._publish_scan()
 
     async def set_base_velocity(
         self, linear_x: float, linear_y: float, angular_z: float
     ) -> Velocity:
-        """Take the velocity at once."""
+        """Set the velocity at once; return the commanded velocity, without `gain`."""
         if not self._open:
             raise BodyLost("the mock is not open")
-        to = self.bounded(linear_x, linear_y, angular_z)
+        target = self.bounded(linear_x, linear_y, angular_z)
         self._velocity = Velocity(
-            linear_x=to.linear_x * self._gain,
-            linear_y=to.linear_y * self._gain,
-            angular_z=to.angular_z * self._gain,
+            linear_x=target.linear_x * self._gain,
+            linear_y=target.linear_y * self._gain,
+            angular_z=target.angular_z * self._gain,
         )
-        return to
+        return target
 
     async def read_state(self) -> RobotState:
         """Return the state with the integrated pose."""
@@ -110,21 +110,21 @@ class MockBody(Driver):
         )
         self._ticks += 1
 
-    def _turn(self) -> None:
-        """Emit a scan after each turn of the lidar."""
+    def _publish_scan(self) -> None:
+        """Publish a scan if a turn of the simulated lidar ends."""
         lidar = None if self._lidar else self.robot.lidar
-        if lidar and self._ticks >= self._next_scan:
-            period = max(1, round(1 / (lidar.rate_hz * TICK_S)))
-            self._next_scan = (self._ticks // period + 1) * period
-            if scan := self._look():
+        if lidar and self._ticks >= self._next_scan_tick:
+            period_ticks = max(1, round(1 / (lidar.rate_hz * TICK_S)))
+            self._next_scan_tick = (self._ticks // period_ticks + 1) * period_ticks
+            if scan := self._scan():
                 self.publish("scan", SCAN, scan)
 
-    def _look(self) -> LaserScan | None:
-        """Measure a round room, with a centimetre of noise."""
+    def _scan(self) -> LaserScan | None:
+        """Return a scan of a round room, with 1 cm of noise; None without a lidar."""
         lidar = self.robot.lidar
         if lidar is None:
             return None
-        ranges = ROOM_M + self._noise.normal(0.0, 0.01, lidar.beams)
+        ranges = ROOM_RADIUS_M + self._noise.normal(0.0, 0.01, lidar.beams)
         return LaserScan(
             angle_min=0.0,
             angle_increment=2 * math.pi / lidar.beams,
