@@ -1,4 +1,4 @@
-"""A line is closed only once all that was written to it is on the wire."""
+"""A line is closed only after all written bytes are sent."""
 
 import asyncio
 from pathlib import Path
@@ -25,7 +25,7 @@ OPTIONS = LineOptions(
 )
 
 
-async def test_a_stop_string_is_on_the_wire_before_the_port_is_closed(
+async def test_a_stop_string_is_sent_before_the_port_is_closed(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     clock, written, closed_ns = FakeClock(), bytearray(), list[int]()

@@ -1,4 +1,4 @@
-"""A body on a text line in YAML: what is wrong in it is refused with its field and its line."""
+"""A body on a text line in YAML: errors name the field and the line."""
 
 from pathlib import Path
 
@@ -95,7 +95,7 @@ def test_a_command_that_does_not_fit_the_body_is_refused(
 @pytest.mark.parametrize(
     "command", ["{linear_x|mm/s:d},{linear_y},{angular_z}", "{linear_x:+.2f}{angular_z:+.2f}"]
 )
-def test_a_command_that_fits_the_body_is_taken(tmp_path: Path, command: str) -> None:
+def test_a_command_that_fits_the_body_is_accepted(tmp_path: Path, command: str) -> None:
     loaded(tmp_path, BARE.replace("{linear_x:.3f},{angular_z:.3f}", command))
 
 
@@ -111,7 +111,7 @@ def test_a_command_that_fits_the_body_is_taken(tmp_path: Path, command: str) -> 
         (["{linear_x}{angular_z}"], r"\[0\]: \{linear_x\} and \{angular_z\} touch"),
     ],
 )
-def test_a_state_that_does_not_say_how_the_body_moves_is_refused(
+def test_a_state_without_the_bodys_motion_is_refused(
     tmp_path: Path, state: list[str], complaint: str
 ) -> None:
     with pytest.raises(ConfigError, match=r"robot\.yaml:13: real\.state" + complaint):
@@ -127,7 +127,7 @@ def test_a_state_that_does_not_say_how_the_body_moves_is_refused(
         ["{linear_x},{angular_z}", "B,{battery_percentage},{_}"],
     ],
 )
-def test_a_state_that_says_how_the_body_moves_is_taken(tmp_path: Path, state: list[str]) -> None:
+def test_a_state_with_the_bodys_motion_is_accepted(tmp_path: Path, state: list[str]) -> None:
     loaded(tmp_path, with_state(state))
 
 
@@ -157,7 +157,7 @@ def test_a_state_that_says_how_the_body_moves_is_taken(tmp_path: Path, state: li
         ),
     ],
 )
-def test_what_does_not_fit_together_is_refused_with_file_and_line(
+def test_fields_that_do_not_fit_together_are_refused_with_file_and_line(
     tmp_path: Path, right: str, wrong: str, complaint: str
 ) -> None:
     assert right in BARE
@@ -178,26 +178,26 @@ def with_state(lines: list[str]) -> str:
     )
 
 
-def test_a_third_base_takes_fewer_than_twenty_lines() -> None:
+def test_a_base_of_a_third_party_needs_fewer_than_twenty_lines() -> None:
     assert len(THIRD.read_text().splitlines()) < 20
     robot, driver = catalog.make_driver(str(THIRD), Run(folder=THIRD.parent, link="real"))
     assert isinstance(driver, LineDriver)
     assert catalog.robot_links(robot) == ["sim", "emulated", "real"]
 
 
-def test_the_third_base_stands_in_the_docs_as_it_is_here() -> None:
+def test_the_base_of_a_third_party_is_in_the_docs() -> None:
     page = Path(__file__).parents[3] / "docs" / "reference" / "firmware_line.md"
     assert THIRD.read_text() in page.read_text()
 
 
-def test_the_third_base_turns_metres_into_revolutions() -> None:
+def test_the_base_of_a_third_party_is_commanded_in_revolutions() -> None:
     _, driver = catalog.make_driver(str(THIRD), Run(folder=THIRD.parent, link="real"))
     assert isinstance(driver, LineDriver)
     line = driver._command.template.encode({"wheel_left": 1.0, "wheel_right": -2.0})
     assert line == b"$MOT,9.5,-19.1*4E\r\n"
 
 
-def test_mycustombot_says_what_the_issue_wants() -> None:
+def test_mycustombot_has_these_options() -> None:
     run = Run(folder=Path(), link="real")
     robot, _, options, _ = catalog.load_link("mycustombot", run)
     assert isinstance(options, LineOptions)
@@ -207,7 +207,7 @@ def test_mycustombot_says_what_the_issue_wants() -> None:
     assert (robot.wheel_separation, robot.wheel_radius) == (0.5, 0.08)
 
 
-def test_the_emulated_link_is_the_real_one_on_other_ports() -> None:
+def test_the_emulated_link_is_the_real_link_on_other_ports() -> None:
     folder = Path()
     _, _, real, _ = catalog.load_link("mycustombot", Run(folder=folder, link="real"))
     run = Run(folder=folder, link="emulated", emulator="/run/ports")
@@ -219,7 +219,7 @@ def test_the_emulated_link_is_the_real_one_on_other_ports() -> None:
     assert (emulated.command, emulated.state) == (real.command, real.state)
 
 
-def test_an_emulated_section_of_its_own_says_where_its_ports_are(tmp_path: Path) -> None:
+def test_an_emulated_section_may_name_its_ports(tmp_path: Path) -> None:
     mine = tmp_path / "robot.yaml"
     text = BARE.replace("real:", "emulated:").replace('"{port}"', '"{emulator}/uart"')
     mine.write_text(text)

@@ -1,4 +1,4 @@
-"""Lines of text by template: written, read back, and hostile ones refused."""
+"""Lines of text by template: encoded, decoded, and refused if invalid."""
 
 import math
 
@@ -26,7 +26,7 @@ TICKS = Template(
 )
 
 
-def test_a_tenth_forwards_and_half_a_radian() -> None:
+def test_a_command_line_has_these_bytes() -> None:
     line = BARE.encode({"linear_x": 0.1, "angular_z": 0.5})
     assert line == bytes.fromhex("562c302e3130302c302e3530300a")  # V,0.100,0.500
 
@@ -35,17 +35,17 @@ def test_a_tenth_forwards_and_half_a_radian() -> None:
     ("name", "value"),
     [("xor8", 0x31), ("crc8", 0xF4), ("crc16", 0x29B1), ("crc32", 0xCBF43926)],
 )
-def test_checksums_of_the_usual_nine_digits(name: str, value: int) -> None:
+def test_checksums_of_the_usual_check_string(name: str, value: int) -> None:
     assert CHECKS[name].of(b"123456789") == value
 
 
-def test_an_nmea_sentence_of_its_standard() -> None:
+def test_an_nmea_0183_sentence_decodes() -> None:
     template = Template("$GPGLL,{_},N,{_},W,{_},A*{xor8}\n", STATE)
     assert template.decode(b"$GPGLL,4916.45,N,12311.12,W,225444,A*31") == {}
     assert template.decode(b"$GPGLL,4916.45,N,12311.12,W,225445,A*31") is None
 
 
-def test_a_state_line_in_si_units() -> None:
+def test_a_state_line_decodes_to_si_units() -> None:
     line = b"S,-4096,2048,12345,315,0A*"
     crc = CHECKS["crc16"].of(line[:-1])
     values = TICKS.decode(line + f"{crc:04X}".encode())
@@ -57,13 +57,13 @@ def test_a_state_line_in_si_units() -> None:
     assert values["flags"] == 0x0A
 
 
-def test_the_crc_of_a_whole_line_is_this() -> None:
+def test_a_state_line_has_this_crc() -> None:
     values = {"wheel_left_position": math.tau, "battery_voltage": 12.0, "flags": 1.0}
     assert TICKS.encode(values) == b"S,4096,0,12000,0,01*563E\n"
 
 
 @given(st.floats(-9.0, 9.0), st.floats(-9.0, 9.0))
-def test_what_is_written_is_read_back_to_the_last_digit(x: float, z: float) -> None:
+def test_a_command_round_trips_to_its_last_digit(x: float, z: float) -> None:
     line = BARE.encode({"linear_x": x, "angular_z": z}, toward_zero=True)
     values = BARE.decode(line[:-1])
     assert values is not None
@@ -72,7 +72,7 @@ def test_what_is_written_is_read_back_to_the_last_digit(x: float, z: float) -> N
 
 
 @given(st.data())
-def test_every_field_comes_back_in_every_unit(data: st.DataObject) -> None:
+def test_every_field_round_trips_in_every_unit(data: st.DataObject) -> None:
     for known in (COMMAND, STATE):
         name = data.draw(st.sampled_from([n for n in known if n != "_"]))
         unit = data.draw(st.sampled_from(list(UNITS[known[name]])))
@@ -123,7 +123,7 @@ def test_a_unit_may_have_a_number_before_it_and_a_sign() -> None:
         ("V,{linear_x.__class__}\n", "no field"),
     ],
 )
-def test_a_mistake_in_a_template_is_named(text: str, complaint: str) -> None:
+def test_a_mistake_in_a_template_is_explained(text: str, complaint: str) -> None:
     with pytest.raises(ValueError, match=complaint):
         Template(text, COMMAND)
 
@@ -138,11 +138,11 @@ def test_a_mistake_in_a_template_is_named(text: str, complaint: str) -> None:
         b"V,0.100,0.500\x00", b"V,1_0.000,0.500", b"V,9999999999999.000,0.000",
     ],
 )  # fmt: skip
-def test_what_is_not_exactly_such_a_line_is_none(line: bytes) -> None:
+def test_a_line_that_does_not_match_exactly_is_refused(line: bytes) -> None:
     assert BARE.decode(line) is None
 
 
-def test_a_number_without_a_given_format_may_be_padded_and_short() -> None:
+def test_a_number_without_a_format_may_be_padded_and_short() -> None:
     template = Template("O {linear_x} {angular_z}\n", STATE)
     assert template.decode(b"O   0.5 -1.") == {"linear_x": 0.5, "angular_z": -1.0}
     assert template.decode(b"O 1e9 0") is None
@@ -153,7 +153,7 @@ def lines(count: int) -> list[bytes]:
 
 
 @given(st.lists(st.integers(1, 40), min_size=1, max_size=30))
-def test_however_the_bytes_are_cut_the_lines_are_whole(cuts: list[int]) -> None:
+def test_lines_are_found_in_pieces_of_any_size(cuts: list[int]) -> None:
     data, decoder, found = b"".join(lines(20)), LineDecoder((BARE,)), []
     for cut in cuts:
         found += decoder.feed(data[:cut])
@@ -163,7 +163,7 @@ def test_however_the_bytes_are_cut_the_lines_are_whole(cuts: list[int]) -> None:
     assert decoder.errors == 0
 
 
-def test_a_banner_is_no_error_and_what_comes_between_is() -> None:
+def test_a_banner_is_no_error_but_an_invalid_line_after_it_is() -> None:
     decoder = LineDecoder((BARE,))
     decoder.feed(b"\xff\x00Arduino\r\nbooting\r\n" + lines(1)[0])
     assert decoder.errors == 0
@@ -171,7 +171,7 @@ def test_a_banner_is_no_error_and_what_comes_between_is() -> None:
     assert decoder.errors == 1
 
 
-def test_a_line_that_is_too_long_costs_one_error_and_the_next_one_is_read() -> None:
+def test_a_line_that_is_too_long_is_one_error_and_the_next_one_is_read() -> None:
     decoder = LineDecoder((BARE,))
     decoder.feed(lines(1)[0])
     for _ in range(50):
@@ -182,13 +182,13 @@ def test_a_line_that_is_too_long_costs_one_error_and_the_next_one_is_read() -> N
 
 
 @given(st.binary(max_size=2000))
-def test_no_bytes_make_it_raise_or_grow(data: bytes) -> None:
+def test_the_decoder_never_raises_and_keeps_at_most_one_line(data: bytes) -> None:
     decoder = LineDecoder((BARE, TICKS))
     decoder.feed(data)
     assert len(decoder._rest) <= MAX_LINE_BYTES
 
 
-def test_a_crlf_line_and_its_bare_cousin_are_read_alike() -> None:
+def test_lines_may_end_with_crlf_or_lf() -> None:
     template = Template("V,{linear_x:.3f}\r\n", COMMAND)
     assert LineDecoder((template,)).feed(b"V,0.100\r\nV,0.200\n") == [
         {"linear_x": 0.1},
@@ -196,16 +196,16 @@ def test_a_crlf_line_and_its_bare_cousin_are_read_alike() -> None:
     ]
 
 
-def test_every_single_flipped_bit_of_a_checked_line_is_noticed() -> None:
+def test_a_line_with_a_checksum_and_one_flipped_bit_is_refused() -> None:
     line = TICKS.encode({"wheel_left_position": 3.0, "battery_voltage": 12.0})[:-1]
     right = TICKS.decode(line)
     for bit in range(8 * len(line)):
         flipped = bytearray(line)
         flipped[bit // 8] ^= 1 << bit % 8
-        assert TICKS.decode(bytes(flipped)) in (None, right)  # the case of a hex digit is no error
+        assert TICKS.decode(bytes(flipped)) in (None, right)  # hex digits may be of either case
 
 
-def test_a_bare_line_lets_a_flipped_digit_through() -> None:
+def test_a_flipped_bit_is_not_noticed_without_a_checksum() -> None:
     line = bytearray(b"V,0.100,0.500")
     line[4] ^= 8  # 1 -> 9
     assert BARE.decode(bytes(line)) == {"linear_x": 0.9, "angular_z": 0.5}

@@ -1,4 +1,4 @@
-"""Robot states from the lines of a body: pose, velocity, battery, wheels, restarts."""
+"""Robot states from a body's lines: pose, velocity, battery, wheels, restarts and losses."""
 
 import math
 from pathlib import Path
@@ -38,7 +38,7 @@ def wheels(left: float, right: float) -> dict[str, float]:
     return {"wheel_left_position": left, "wheel_right_position": right}
 
 
-def test_wheels_that_turn_alike_go_straight() -> None:
+def test_wheels_that_turn_alike_move_the_body_straight() -> None:
     it = report()
     it.update(wheels(1.0, 1.0), 20 * MS)
     for n in range(1, 11):
@@ -48,14 +48,14 @@ def test_wheels_that_turn_alike_go_straight() -> None:
     assert it.joints(0)[0].position == pytest.approx(0.5)
 
 
-def test_counts_that_wrap_go_on() -> None:
+def test_counters_may_wrap() -> None:
     it = report(replace(OPTIONS, tick_bits=16))
     it.update(wheels(32760 * TICK, 32760 * TICK), 20 * MS)
     it.update(wheels(-32760 * TICK, -32760 * TICK), 40 * MS)
     assert it.pose.x == pytest.approx(16 * TICK * 0.08)
 
 
-def test_counts_that_jump_are_no_way() -> None:
+def test_a_jump_of_the_counters_is_no_motion() -> None:
     it = report()
     it.update(wheels(10.0, 10.0), 20 * MS)
     it.update(wheels(0.0, 0.0), 40 * MS)
@@ -63,30 +63,30 @@ def test_counts_that_jump_are_no_way() -> None:
     assert it.pose.x == pytest.approx(0.004)
 
 
-@pytest.mark.parametrize("late_by", [1, 4, 10])
-def test_lines_that_come_at_once_count_as_those_that_come_in_time(late_by: int) -> None:
+@pytest.mark.parametrize("delayed_lines", [1, 4, 10])
+def test_lines_that_arrive_together_count_as_lines_in_time(delayed_lines: int) -> None:
     it, turn = report(replace(OPTIONS, state_hz=20.0)), ROBOT.max_angular_speed
     base = wheels_of(ROBOT)
     assert base
     left, right = base.to_wheels(Twist(0.0, 0.0, turn))
-    for n in range(41):  # lines 10 to 10 + `late_by` come in one read
-        read = 10 + late_by if 10 <= n < 10 + late_by else n
+    for n in range(41):  # `delayed_lines` lines from line 10 on arrive in one read
+        read = 10 + delayed_lines if 10 <= n < 10 + delayed_lines else n
         it.update(wheels(0.05 * n * left, 0.05 * n * right), (20 + 50 * read) * MS)
     assert it.pose.yaw == pytest.approx(math.remainder(2.0 * turn, math.tau))
 
 
-def test_counts_that_jump_are_no_way_among_lines_that_come_at_once() -> None:
+def test_a_jump_of_the_counters_is_no_motion_in_lines_that_arrive_together() -> None:
     it = report()
     it.update(wheels(0.0, 0.0), 20 * MS)
-    for angle in (0.05, 0.1, 10.0, 0.15, 0.2):  # a tenth of a second, then a wrong number
+    for angle in (0.05, 0.1, 10.0, 0.15, 0.2):  # after 0.1 s; one number is wrong
         it.update(wheels(angle, angle), 120 * MS)
     assert it.pose.x == pytest.approx(0.15 * 0.08)
     it.update(wheels(0.2, 0.2), 220 * MS)
-    it.update(wheels(2.0, 2.0), 240 * MS)  # it was not held up: it has no more than its 20 ms
+    it.update(wheels(2.0, 2.0), 240 * MS)  # not delayed: too fast for 20 ms
     assert it.pose.x == pytest.approx(0.15 * 0.08)
 
 
-def test_after_a_gap_the_shorter_way_counts() -> None:
+def test_after_a_gap_the_shorter_motion_is_used() -> None:
     rolled, restarted = report(), report()
     for it in (rolled, restarted):
         it.update(wheels(5.0, 5.0), 20 * MS)
@@ -96,16 +96,16 @@ def test_after_a_gap_the_shorter_way_counts() -> None:
     assert restarted.pose.x == pytest.approx(0.008)
 
 
-def test_the_firmwares_own_pose_is_followed_from_where_it_begins() -> None:
+def test_the_pose_follows_the_firmwares_pose_from_its_first_value() -> None:
     it = report()
     it.update({"x": 5.0, "y": 1.0, "yaw": math.pi / 2}, 20 * MS)
     it.update({"x": 5.0, "y": 1.01, "yaw": math.pi / 2}, 40 * MS)
     assert (it.pose.x, it.pose.y) == pytest.approx((0.01, 0.0))
-    it.update({"x": 0.0, "y": 0.0, "yaw": 0.0}, 500 * MS)  # started anew
+    it.update({"x": 0.0, "y": 0.0, "yaw": 0.0}, 500 * MS)  # restarted
     assert (it.pose.x, it.pose.y) == pytest.approx((0.01, 0.0))
 
 
-def test_a_reported_velocity_is_integrated_where_there_is_no_position() -> None:
+def test_a_reported_velocity_is_integrated_without_positions() -> None:
     it = report()
     for n in range(1, 52):
         it.update({"linear_x": 0.1, "angular_z": 0.0}, 20 * n * MS)
@@ -113,14 +113,14 @@ def test_a_reported_velocity_is_integrated_where_there_is_no_position() -> None:
     assert it.velocity().linear_x == 0.1
 
 
-def test_the_wheels_speeds_are_the_velocity() -> None:
+def test_the_velocity_follows_from_wheel_speeds() -> None:
     it = report()
     it.update({"wheel_left_velocity": 1.0, "wheel_right_velocity": 2.0}, 20 * MS)
     assert it.velocity().linear_x == pytest.approx(0.12)
     assert it.velocity().angular_z == pytest.approx(0.16)
 
 
-def test_where_there_are_wheel_speeds_alone_the_pose_is_their_integral() -> None:
+def test_wheel_speeds_are_integrated_without_positions() -> None:
     it = report()
     for n in range(1, 52):
         it.update({"wheel_left_velocity": 1.0, "wheel_right_velocity": 2.0}, 20 * n * MS)
@@ -129,7 +129,7 @@ def test_where_there_are_wheel_speeds_alone_the_pose_is_their_integral() -> None
     assert it.joints(0)[1].position == pytest.approx(2.0)
 
 
-def test_wheel_speeds_may_come_line_by_line() -> None:
+def test_wheel_speeds_may_be_in_different_lines() -> None:
     it = report()
     for n in range(1, 52):
         it.update({"wheel_left_velocity": 1.0}, (20 * n - 10) * MS)
@@ -137,7 +137,7 @@ def test_wheel_speeds_may_come_line_by_line() -> None:
     assert (it.pose.x, it.pose.yaw) == pytest.approx((0.08, 0.0), abs=0.001)
 
 
-def test_each_part_of_the_velocity_comes_from_where_it_is_known() -> None:
+def test_each_part_of_the_velocity_has_its_own_source() -> None:
     it = report()
     for n in range(11):
         it.update({"linear_x": 0.25, **wheels(0.0, 0.05 * n)}, (20 + 20 * n) * MS)
@@ -148,7 +148,9 @@ def test_each_part_of_the_velocity_comes_from_where_it_is_known() -> None:
 @pytest.mark.parametrize(
     ("volts", "percent"), [(9.9, 0), (11.25, 50), (12.6, 100), (14, 100), (5, 0)]
 )
-def test_the_battery_by_its_voltage(volts: float, percent: float) -> None:
+def test_the_percentage_of_the_battery_follows_from_its_voltage(
+    volts: float, percent: float
+) -> None:
     it = report()
     assert it.battery(0) is None
     it.update({"battery_voltage": volts}, 20 * MS)
@@ -157,7 +159,7 @@ def test_the_battery_by_its_voltage(volts: float, percent: float) -> None:
     assert (battery.voltage, battery.percentage) == pytest.approx((volts, percent))
 
 
-def test_temperatures_belong_to_their_wheels() -> None:
+def test_wheels_have_their_temperatures() -> None:
     it = report()
     it.update({"wheel_left_temperature": 31.5, "wheel_right_temperature": 30.0}, 20 * MS)
     assert [(j.name, j.temperature) for j in it.joints(20 * MS)] == [
@@ -166,7 +168,7 @@ def test_temperatures_belong_to_their_wheels() -> None:
     ]
 
 
-def test_a_car_is_reckoned_by_its_steering_angle() -> None:
+def test_the_odometry_of_a_car_uses_its_steering_angle() -> None:
     robot = replace(
         ROBOT, drive_type="ackermann", wheel_base=0.5, max_linear_speed=2.0, max_angular_speed=2.0
     )
@@ -182,7 +184,7 @@ def test_a_car_is_reckoned_by_its_steering_angle() -> None:
     assert it.joints(0)[1].position == pytest.approx(steering)
 
 
-async def test_a_battery_and_temperatures_that_come_no_more_are_not_reported() -> None:
+async def test_a_battery_and_temperatures_expire_without_new_values() -> None:
     clock = FakeClock()
     driver = LineDriver(ROBOT, TWO_LINES, Run(folder=Path(), link="real"), clock=clock)
     odometry, power = TWO_LINES.state_templates()
@@ -215,7 +217,7 @@ async def test_a_battery_and_temperatures_that_come_no_more_are_not_reported() -
         (("A,{linear_x},{angular_z}\n", "B,{battery_percentage}\n"), (0,)),
     ],
 )
-async def test_a_body_is_lost_once_a_line_with_its_velocity_comes_no_more(
+async def test_a_body_is_lost_without_a_line_that_has_its_velocity(
     lines: tuple[str, ...], needed: tuple[int, ...]
 ) -> None:
     clock = FakeClock()
@@ -237,8 +239,8 @@ async def test_a_body_is_lost_once_a_line_with_its_velocity_comes_no_more(
         assert await connected_without(None)
 
 
-@pytest.mark.parametrize("every", [5, 8])  # of the quick one's lines, 20 ms each
-async def test_a_body_is_there_although_one_line_of_its_velocity_is_slower(every: int) -> None:
+@pytest.mark.parametrize("every", [5, 8])  # slow lines come after so many quick ones, 20 ms each
+async def test_a_body_is_connected_although_one_line_of_its_velocity_is_slower(every: int) -> None:
     clock = FakeClock()
     options = replace(TWO_LINES, state=("V,{linear_x}\n", "G,{angular_z}\n"))
     driver = LineDriver(ROBOT, options, Run(folder=Path(), link="real"), clock=clock)
@@ -259,9 +261,9 @@ FLAGGED = replace(TWO_LINES, state=(TWO_LINES.state[0], "F,{flags}\n"), flags=("
 
 @pytest.mark.parametrize(
     ("period", "lost"),
-    [(1, True), (25, True), (None, False)],  # a line each so many of motion; None: on changes
+    [(1, True), (25, True), (None, False)],  # in motion lines; None: flags are sent on changes only
 )
-async def test_a_body_is_lost_once_flags_that_it_repeats_come_no_more(
+async def test_a_body_is_lost_without_flags_that_it_repeated(
     period: int | None, lost: bool, caplog: pytest.LogCaptureFixture
 ) -> None:
     clock = FakeClock()
@@ -287,7 +289,7 @@ async def test_a_body_is_lost_once_flags_that_it_repeats_come_no_more(
     assert back.bumpers == (True,)
 
 
-def test_a_percentage_that_comes_no_more_is_not_an_empty_battery() -> None:
+def test_an_expired_percentage_is_not_an_empty_battery() -> None:
     it = report(TWO_LINES)
     for n in range(50):
         it.update({"battery_percentage": 80.0}, 20 * n * MS)

@@ -1,1 +1,1 @@
-"""A base on a line of text, described in YAML: options, protocol, driver and emulator."""
+"""A base on a text line that YAML describes: options, protocol, driver and emulator."""

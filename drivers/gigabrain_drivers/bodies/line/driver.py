@@ -1,4 +1,4 @@
-"""A body without code: text lines to and from it, described in the robot's file.
+"""Driver of a base on a text line, which the robot's file describes: it needs no code.
 
 The driver sends only commands that it receives. When they end, the firmware stops the body
 (docs/reference/firmware_line.md).
@@ -36,22 +36,22 @@ from gigabrain_zenoh.logs import Fault
 
 log = logging.getLogger(__name__)
 
-MISSED_LINES = 3  # the body counts as lost after this many missing state lines in a row
-MIN_TIMEOUT_NS = 100_000_000
-MAX_TIMEOUT_NS = 500_000_000  # of the slowest line
-REPEAT_SHARE = 0.9  # repeat after this share of the period, because ticks are uneven
+MISSED_LINES = 3  # the body counts as lost after this many missing state lines in a row,
+MIN_TIMEOUT_NS = 100_000_000  # but not before this time
+MAX_TIMEOUT_NS = 500_000_000  # of a slower line with a part of the velocity
+REPEAT_SHARE = 0.9  # commands repeat after this share of the period, because ticks are uneven
 NO_VALID_LINE = (
     "no valid line comes, or one that is part of the velocity is missing: "
     "check firmware, baud rate and wiring"
 )
-BUMPER = "bumper"  # prefix of the names of bumper flags
-PROBE_S = 2.5  # opening the port resets an Arduino, which then takes two seconds to send
-FLUSH_NS = 10_000_000  # before a port is closed, plus the time of the written bytes
+BUMPER = "bumper"  # part of the names of bumper flags
+PROBE_S = 2.5  # opening the port resets an Arduino, which sends two seconds later
+FLUSH_NS = 10_000_000  # pause before a port is closed, plus the duration of the written bytes
 SEQUENCES = 1 << 16
 
 
 class LineDriver(Driver):
-    """Sends nothing until the body reports. Its first command is zero, also after a loss."""
+    """Sends nothing before the body reports. Its first command is zero, also after a loss."""
 
     Options = LineOptions
 
@@ -63,7 +63,7 @@ class LineDriver(Driver):
         self._command = LineCommand(options.command_template(), base)
         self._decoder = LineDecoder(options.state_templates())
         self._clock = clock or Clock()
-        self.link = SerialLink(options.port, options.baud, self._clock, probe=self._is_ours)
+        self.link = SerialLink(options.port, options.baud, self._clock, probe=self._is_right_port)
         self.link.wording = Wording(
             Spelling(SentWording(self._command.template, options.strings()).feed, str),
             Spelling(LineDecoder(options.state_templates()).feed, describe),
@@ -72,18 +72,18 @@ class LineDriver(Driver):
         self.link.on_lost = self._lost
         self._report = LineReport(options, robot, base)
         silent_ns = max(round(MISSED_LINES / options.state_hz * 1e9), MIN_TIMEOUT_NS)
-        self._parts = {  # of the velocity
+        self._parts = {  # newest parts of the velocity
             name: Recent[float](silent_ns, max(silent_ns, MAX_TIMEOUT_NS))
             for name in velocity_fields(options, robot)
         }
         self._liveness = Liveness(self.link, self._clock, silent_ns, NO_VALID_LINE, log)
         self._repeat_ns = round(REPEAT_SHARE / options.command_hz * 1e9)
-        self._started = False  # the start string was sent, and no stop string since
-        self._wanted = self._as_sent = self._sent = ZERO  # the second is rounded by the line
+        self._started = False  # True from the start string to the stop string
+        self._wanted = self._rounded = self._sent = ZERO  # commanded, rounded by the line, executed
         self._sent_ns = self._seq = 0
         self._open = False
         self._logged_flags = 0
-        self._overdue = Fault(log)  # of repeated flags
+        self._no_flags = Fault(log)
         self._flags = {bit: Fault(log) for bit in range(len(options.flags))}
         self._lidar: ScanSource | None = None
         self.sensors = {"scan": None} if robot.lidar else {}
@@ -94,7 +94,7 @@ class LineDriver(Driver):
         check_lines(options, robot)
 
     async def open(self) -> None:
-        """Start connecting to the body and its lidar; both may appear later."""
+        """Start to connect to the body and its lidar, which may appear later."""
         self._open = True
         self.link.open()
         self._lidar = open_lidar(self, self._clock)
@@ -124,13 +124,13 @@ class LineDriver(Driver):
         return self._sent
 
     async def read_state(self) -> RobotState:
-        """Return the newest values of the lines; its `link` shows whether they are recent."""
+        """Return the newest values; `link.connected` is False if they are too old."""
         report, now_ns = self._report, self._clock.now_ns()
         alive, overdue = self._liveness.alive(), report.flags_overdue(now_ns)
         if alive and overdue:
-            self._overdue.begin(f"{self.link}: its flags come no more: check firmware and wiring")
+            self._no_flags.begin(f"{self.link}: its flags come no more: check firmware and wiring")
         elif alive:
-            self._overdue.end(f"{self.link}: its flags come again")
+            self._no_flags.end(f"{self.link}: its flags come again")
         return RobotState(
             robot_type=self.robot.robot_type,
             pose=report.pose,
@@ -142,7 +142,7 @@ class LineDriver(Driver):
         )
 
     def _longest_write_ns(self) -> int:
-        """Return the duration on the line of start string, command and stop string [ns]."""
+        """Return how long the line needs for start string, commands and stop string [ns]."""
         options: LineOptions = self.options
         command = self._command.template.longest()
         bits = (2 * command + len(options.start) + len(options.stop)) * BITS_PER_BYTE
@@ -155,21 +155,21 @@ class LineDriver(Driver):
             self._started = bool(stop) and not self.link.write(stop)
 
     def _send(self, wanted: Velocity) -> None:
-        """Write a command that is new or due; store the velocity that the body executes."""
+        """Write a command that is new or due, and store the velocity that the body executes."""
         if not self._liveness.received:  # do not disturb its boot
             self._sent = ZERO
             return
         now_ns = self._clock.now_ns()
         if wanted != self._wanted:
-            self._wanted, self._as_sent = wanted, self._command.sent(wanted)
-        sent = self._as_sent
-        if sent == self._sent and now_ns - self._sent_ns < self._repeat_ns:
+            self._wanted, self._rounded = wanted, self._command.sent(wanted)
+        rounded = self._rounded
+        if rounded == self._sent and now_ns - self._sent_ns < self._repeat_ns:
             return
-        if sent != ZERO and not self._started:
+        if rounded != ZERO and not self._started:
             self._start()
         self._seq = (self._seq + 1) % SEQUENCES
         line = self._command.line(wanted, self._seq)
-        self._sent, self._sent_ns = (sent if self.link.write(line) else ZERO), now_ns
+        self._sent, self._sent_ns = (rounded if self.link.write(line) else ZERO), now_ns
 
     def _start(self) -> None:
         start = self.options.start.encode()
@@ -189,22 +189,22 @@ class LineDriver(Driver):
         now_ns = self._clock.now_ns()
         for values in self._decoder.feed(data):
             self._report.update(values, now_ns)
-            if self._is_whole(values, now_ns) and self._liveness.mark_received():
-                # after a boot or a loss it begins at rest
+            if self._reports_motion(values, now_ns) and self._liveness.mark_received():
+                # it starts at rest after a boot or a loss
                 self._sent_ns = 0
                 self._send_zero()
             self._log_flags()
         self.link.errors = self._decoder.errors
 
-    def _is_whole(self, values: Mapping[str, float], now_ns: int) -> bool:
-        """Return whether a line reports motion, and no part of the velocity is overdue."""
-        own = self._parts.keys() & values.keys()
-        for name in own:
+    def _reports_motion(self, values: Mapping[str, float], now_ns: int) -> bool:
+        """Return whether a line has a part of the velocity, and no other part is overdue."""
+        in_line = self._parts.keys() & values.keys()
+        for name in in_line:
             self._parts[name].put(values[name], now_ns)
-        return bool(own) and all(part.get(now_ns) is not None for part in self._parts.values())
+        return bool(in_line) and all(part.get(now_ns) is not None for part in self._parts.values())
 
     def _bumpers(self) -> tuple[bool, ...]:
-        """Return the flags whose names begin with `bumper`."""
+        """Return the flags whose names contain `bumper`."""
         names = enumerate(self.options.flags)
         return tuple(bool(self._report.flags >> bit & 1) for bit, name in names if BUMPER in name)
 
@@ -221,7 +221,7 @@ class LineDriver(Driver):
             else:
                 self._flags[bit].end(f"the firmware no longer reports: {name}")
 
-    def _is_ours(self, port: serial.Serial) -> bool:
+    def _is_right_port(self, port: serial.Serial) -> bool:
         """Return whether this port sends a valid line. Runs in a thread."""
         decoder, until = LineDecoder(self.options.state_templates()), time.monotonic() + PROBE_S
         while time.monotonic() < until:

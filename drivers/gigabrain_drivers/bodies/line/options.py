@@ -1,4 +1,4 @@
-"""The `driver: line` part of a robot's file, and checks that its lines fit the body.
+"""Options of `driver: line` in a robot's file, and checks that the lines fit the body.
 
 Each check raises ValueError as `FIELD: what is wrong; what was expected`.
 """
@@ -34,7 +34,7 @@ Rate = Annotated[float, Meta(ge=10, le=200)]
 
 BITS_PER_BYTE = 10  # 8N1
 
-MAX_STEP_SHARE = 0.1  # largest step of a command, as a share of the maximal speed
+MAX_STEP_SHARE = 0.1  # largest resolution of a command, as a share of the maximum speed
 WHEEL_PARTS = ("_position", "_velocity", "_effort", "_temperature")
 SIDES = ("wheel_left", "wheel_right")
 POSE = ("x", "y", "yaw")
@@ -50,9 +50,9 @@ class LineOptions(LinkOptions, frozen=True, kw_only=True, forbid_unknown_fields=
     start: Text = ""  # sent unchanged before the first command, also after a stop
     stop: Text = ""  # sent unchanged when the body is stopped, after a command of zero
     command_hz: Rate = 50.0  # repetition of an unchanged command; a new one is sent at once
-    state_hz: Rate = 50.0  # promised by the firmware; the link is lost after three missing lines
+    state_hz: Rate = 50.0  # rate of the firmware; the link is lost after three missing lines
     ticks_per_turn: Positive | None = None  # of a wheel's encoder; for the unit `tick`
-    tick_bits: Literal[16, 32] = 32  # width of its counter
+    tick_bits: Literal[16, 32] = 32  # width of the encoder's counter
     battery_empty: Positive | None = None  # [V], 0 %; for a firmware that reports only the voltage
     battery_full: Positive | None = None  # [V], 100 %
     flags: Annotated[tuple[Name, ...], Meta(max_length=32)] = ()  # names of the bits, from bit 0
@@ -62,11 +62,11 @@ class LineOptions(LinkOptions, frozen=True, kw_only=True, forbid_unknown_fields=
         if command.names <= {"seq"}:
             raise ValueError("command: it moves nothing; expected {linear_x} or wheel speeds")
         state = self.state_templates()
-        seen = frozenset().union(*(template.names for template in state))
+        reported = frozenset().union(*(template.names for template in state))
         self._check_ends(command, state)
         check_port(self.port)
-        self._check_battery(seen)
-        self._check_flags(seen)
+        self._check_battery(reported)
+        self._check_flags(reported)
         self._check_baud(command, state)
 
     def battery_volts(self) -> tuple[float, float] | None:
@@ -87,7 +87,7 @@ class LineOptions(LinkOptions, frozen=True, kw_only=True, forbid_unknown_fields=
         )
 
     def strings(self) -> dict[bytes, str]:
-        """Return the strings that are sent unchanged, with their names."""
+        """Return the names of the start and stop strings."""
         both = {self.start.encode(): "start", self.stop.encode(): "stop"}
         return {text: name for text, name in both.items() if text}
 
@@ -110,16 +110,16 @@ class LineOptions(LinkOptions, frozen=True, kw_only=True, forbid_unknown_fields=
             if text and not text.endswith(("\n", "\r")):
                 raise ValueError(f"{name}: expected a newline (\\n) at its end")
 
-    def _check_battery(self, seen: frozenset[str]) -> None:
+    def _check_battery(self, reported: frozenset[str]) -> None:
         if self.battery_empty and self.battery_full and self.battery_empty >= self.battery_full:
             raise ValueError("battery_full: expected more than battery_empty")
-        if "battery_voltage" in seen and "battery_percentage" not in seen:
+        if "battery_voltage" in reported and "battery_percentage" not in reported:
             for name in ("battery_empty", "battery_full"):
                 if getattr(self, name) is None:
                     raise ValueError(f"{name}: it is needed where only battery_voltage is reported")
 
-    def _check_flags(self, seen: frozenset[str]) -> None:
-        if self.flags and "flags" not in seen:
+    def _check_flags(self, reported: frozenset[str]) -> None:
+        if self.flags and "flags" not in reported:
             raise ValueError("flags: there is no {flags} in any state line")
 
     def _check_baud(self, command: Template, state: tuple[Template, ...]) -> None:
@@ -146,7 +146,7 @@ def check_lines(options: LineOptions, robot: RobotFile) -> None:
     base, command, state = (
         base_of(options, robot), options.command_template(), options.state_templates(),
     )  # fmt: skip
-    for field, template in {"command": command, **_numbered(state)}.items():
+    for field, template in {"command": command, **_by_name(state)}.items():
         _check_wheels(field, template, robot, base)
     _check_command(command, robot, base)
     _check_steps(command, robot, base)
@@ -160,7 +160,7 @@ def check_lines(options: LineOptions, robot: RobotFile) -> None:
 
 
 def base_of(options: LineOptions, robot: RobotFile) -> Base | None:
-    """Return the wheels in the lines; a skid-steered base may have one per side."""
+    """Return the base whose wheels are in the lines; of skid steer, perhaps one per side."""
     base = wheels_of(robot)
     templates = (options.command_template(), *options.state_templates())
     sides = any(name.startswith(SIDES) for template in templates for name in template.names)
@@ -170,27 +170,27 @@ def base_of(options: LineOptions, robot: RobotFile) -> Base | None:
 
 
 def speed_fields(base: Base) -> tuple[str, ...]:
-    """Return the state fields that give a base's velocity; for steering wheels, angles."""
+    """Return the state fields with a base's velocity; for steering, its angle."""
     return tuple(f"wheel_{n}_{'position' if n in ANGLES else 'velocity'}" for n in base.wheels)
 
 
 def position_fields(base: Base) -> tuple[str, ...]:
-    """Return the state fields that give a base's motion."""
+    """Return the state fields with a base's wheel angles."""
     return tuple(f"wheel_{name}_position" for name in base.wheels)
 
 
 def velocity_fields(options: LineOptions, robot: RobotFile) -> frozenset[str]:
-    """Return the state fields that give the body's velocity, in all lines."""
-    seen = frozenset[str]().union(*(template.names for template in options.state_templates()))
-    ways, base = _ways(robot), base_of(options, robot)
-    own = seen.intersection(ways)
-    if len(own) == len(ways):
-        return own
+    """Return the state fields, in all lines, that determine the body's velocity."""
+    reported = frozenset[str]().union(*(template.names for template in options.state_templates()))
+    axes, base = _axes(robot), base_of(options, robot)
+    direct = reported.intersection(axes)
+    if len(direct) == len(axes):
+        return direct
     speeds, positions = ((speed_fields(base),), (position_fields(base),)) if base else ((), ())
-    return own.union(next(filter(seen.issuperset, (*speeds, POSE, *positions)), ()))
+    return direct.union(next(filter(reported.issuperset, (*speeds, POSE, *positions)), ()))
 
 
-def _numbered(state: tuple[Template, ...]) -> dict[str, Template]:
+def _by_name(state: tuple[Template, ...]) -> dict[str, Template]:
     return {f"state[{i}]": template for i, template in enumerate(state)}
 
 
@@ -199,17 +199,17 @@ def _check_wheels(field: str, template: Template, robot: RobotFile, base: Base |
     for name in sorted(template.names):
         if not name.startswith("wheel_") or name in known:
             continue
-        if lacking := missing_measures(robot):
+        if missing := missing_measures(robot):
             raise ValueError(
                 f"{field}: {{{name}}} on a {robot.drive_type} base needs its "
-                f"{' and '.join(lacking)} at the top of this file, above 0"
+                f"{' and '.join(missing)} at the top of this file, above 0"
             )
         wheels = ", ".join(base.wheels) if base else "none"
         raise ValueError(f"{field}: no {name} on a {robot.drive_type} base; its wheels: {wheels}")
 
 
 def _check_command(command: Template, robot: RobotFile, base: Base | None) -> None:
-    body = _ways(robot)
+    body = _axes(robot)
     choices = [body]
     if base:
         choices.append([f"wheel_{name}" for name in base.wheels])
@@ -219,8 +219,8 @@ def _check_command(command: Template, robot: RobotFile, base: Base | None) -> No
     if any(names == set(choice) for choice in choices) or names == {*body, "linear_y"}:
         return
     nearest = max(choices, key=lambda choice: len(names & set(choice)))
-    if lacking := [name for name in nearest if name not in names]:
-        wrong = f"no {_braced(lacking)}"
+    if missing := [name for name in nearest if name not in names]:
+        wrong = f"no {_braced(missing)}"
     else:
         wrong = f"{_braced(sorted(names - set(nearest)))} beside {_braced(nearest)}"
     needs = ", or ".join(_braced(choice) for choice in choices)
@@ -228,56 +228,56 @@ def _check_command(command: Template, robot: RobotFile, base: Base | None) -> No
 
 
 def _check_steps(command: Template, robot: RobotFile, base: Base | None) -> None:
-    most = {
+    limits = {
         "linear_x": robot.max_linear_speed,
         "linear_y": robot.max_lateral_speed,
         "angular_z": robot.max_angular_speed,
     }
     if base:
         fastest = base.to_wheels(Twist(robot.max_linear_speed, 0.0, 0.0))
-        most |= {f"wheel_{n}": abs(speed) for n, speed in zip(base.wheels, fastest, strict=True)}
+        limits |= {f"wheel_{n}": abs(v) for n, v in zip(base.wheels, fastest, strict=True)}
     if isinstance(base, Ackermann):
-        most["wheel_steering"] = base.max_steering
+        limits["wheel_steering"] = base.max_steering
     for field in command.fields:
-        top = most.get(field.name, 0.0)
-        if top and field.step > MAX_STEP_SHARE * top:
+        limit = limits.get(field.name, 0.0)
+        if limit and field.step > MAX_STEP_SHARE * limit:
             raise ValueError(
                 f"command: {{{field.name}}}: its smallest step is {field.step:.3g}, the most that "
-                f"the body does {top:.3g} (in SI units); expected more decimals or a smaller unit"
+                f"the body does {limit:.3g} (in SI units); expected more decimals or a smaller unit"
             )
 
 
 def _check_odometry(state: tuple[Template, ...], base: Base | None) -> None:
-    """Check that a pose, or all wheels' positions, are in one line, if there are any."""
-    for whole in (POSE, position_fields(base) if base else ()):
-        telling = {
-            n for n in whole if n.removeprefix("wheel_").removesuffix("_position") not in ANGLES
+    """Check that one line has the whole pose, or all wheel positions, if any line has one."""
+    for fields in (POSE, position_fields(base) if base else ()):
+        distances = {
+            n for n in fields if n.removeprefix("wheel_").removesuffix("_position") not in ANGLES
         }
         for i, template in enumerate(state):
-            lacking = [name for name in whole if name not in template.names]
-            if template.names & telling and lacking:
+            missing = [name for name in fields if name not in template.names]
+            if template.names & distances and missing:
                 raise ValueError(
-                    f"state[{i}]: {_braced(whole)} must stand in one line, or none of them; "
-                    f"in this one there is no {_braced(lacking)}"
+                    f"state[{i}]: {_braced(fields)} must stand in one line, or none of them; "
+                    f"in this one there is no {_braced(missing)}"
                 )
 
 
 def _check_motion(state: tuple[Template, ...], robot: RobotFile, base: Base | None) -> None:
     """Check that every motion of the body is measured."""
-    seen = frozenset[str]().union(*(template.names for template in state))
-    wholes = [POSE, *((position_fields(base), speed_fields(base)) if base else ())]
-    if any(seen.issuperset(whole) for whole in wholes):
+    reported = frozenset[str]().union(*(template.names for template in state))
+    alternatives = [POSE, *((position_fields(base), speed_fields(base)) if base else ())]
+    if any(reported.issuperset(fields) for fields in alternatives):
         return
-    ways = _ways(robot)
-    lacking = [name for name in ways if name not in seen]
-    if lacking:
-        what = _braced(lacking) if len(lacking) < len(ways) else "how the body moves"
-        choices = ", or ".join(_braced(whole) for whole in (ways, *wholes))
+    axes = _axes(robot)
+    missing = [name for name in axes if name not in reported]
+    if missing:
+        what = _braced(missing) if len(missing) < len(axes) else "how the body moves"
+        choices = ", or ".join(_braced(fields) for fields in (axes, *alternatives))
         raise ValueError(f"state: no field reports {what}; expected {choices}")
 
 
-def _ways(robot: RobotFile) -> list[str]:
-    """Return the parts of a velocity that the body can have."""
+def _axes(robot: RobotFile) -> list[str]:
+    """Return the names of the body's velocity components."""
     return ["linear_x", *(["linear_y"] if robot.max_lateral_speed else []), "angular_z"]
 
 

@@ -1,9 +1,9 @@
-"""Lines of text with numbers; the same template writes and reads them.
+"""Lines of text with numbers, which a template encodes and decodes.
 
-A template is the line on the wire, with `{FIELD}`, `{FIELD|UNIT}` or
-`{FIELD|UNIT:FORMAT}` where the numbers are: `V,{linear_x:.3f},{angular_z:.3f}` and a newline. A
-checksum (`{crc16}`, see CHECKS) comes last and covers the text before it. As in NMEA 0183, it does
-not cover a `$` at the start, nor a `*` right before the checksum.
+A template is the line on the wire, with `{FIELD}`, `{FIELD|UNIT}` or `{FIELD|UNIT:FORMAT}` in place
+of each number: `V,{linear_x:.3f},{angular_z:.3f}` and a newline. A checksum (`{crc16}`, see CHECKS)
+is the last field, and covers the text before it. As in NMEA 0183, it does not cover a `$` at the
+start, nor a `*` right before the checksum.
 """
 
 import binascii
@@ -22,7 +22,7 @@ _CRC8_TABLE = crc_table(0x07, bits=8)
 
 DRIVES = (Differential, Mecanum, Omni, Ackermann)
 WHEELS = tuple(dict.fromkeys(name for drive in DRIVES for name in drive.wheels))
-ANGLES = ("steering",)  # names in WHEELS whose command is an angle, not a speed
+ANGLES = ("steering",)  # names in WHEELS that are commanded by angle, not speed
 IGNORED = "_"  # name of ignored numbers in a state line
 UNITS = {
     "length": {"m": 1.0, "cm": 0.01, "mm": 0.001},
@@ -66,12 +66,12 @@ STATE = {
 }
 DEFAULT_FORMATS = {"count": "d", "flags": "x"}
 _UNIT = re.compile(r"\s*([-+]?[0-9]*\.?[0-9]*)\s*([A-Za-z%].*?)?\s*")
-ROUNDING = 1e-6  # of a digit: error of binary fractions
+ROUNDING = 1e-6  # of the last digit: error of binary fractions
 _FORMAT = re.compile(r"\+?0?[0-9]{0,2}(?:(?:\.[0-9])?f|d|[xX])")
 _ANY_NUMBER = r" *[-+]?[0-9]{1,12}(?:\.[0-9]{0,9})?"
 MAX_LINE_BYTES = 256
-MAX_VALUE = 1e8  # in SI units; larger numbers are no measurements, except counters
-DIGITS = "0123456789."  # characters that continue a number
+MAX_VALUE = 1e8  # in SI units; larger numbers are invalid, except counters
+DIGITS = "0123456789."  # characters that would continue a number
 _FIELD = re.compile(r"\{([^{}|:]*)(?:\|([^{}|:]*))?(?::([^{}]*))?\}")
 
 
@@ -83,7 +83,7 @@ class Check(NamedTuple):
 
 
 def crc8(data: bytes) -> int:
-    """CRC-8: polynomial 0x07, initial value 0, not reflected; 0xF4 for "123456789"."""
+    """Return the CRC-8: polynomial 0x07, initial 0, not reflected; 0xF4 for "123456789"."""
     crc = 0
     for byte in data:
         crc = _CRC8_TABLE[crc ^ byte]
@@ -91,12 +91,12 @@ def crc8(data: bytes) -> int:
 
 
 def crc16(data: bytes) -> int:
-    """CRC-16/CCITT-FALSE: polynomial 0x1021, initial value 0xFFFF; 0x29B1 for "123456789"."""
+    """Return the CRC-16/CCITT-FALSE: polynomial 0x1021, initial 0xFFFF; 0x29B1 for "123456789"."""
     return binascii.crc_hqx(data, 0xFFFF)
 
 
 def crc32(data: bytes) -> int:
-    """CRC-32 of Ethernet and zlib; 0xCBF43926 for "123456789"."""
+    """Return the CRC-32 of Ethernet and zlib; 0xCBF43926 for "123456789"."""
     return zlib.crc32(data)
 
 
@@ -111,8 +111,8 @@ CHECKS = {
 def factor(quantity: str, unit: str, ticks_per_turn: float | None) -> float:
     """Return the factor from a number on the wire to SI units (also volts, degrees C, percent).
 
-    A unit may have a number before it: in `0.1C` or `-tick`, the wire counts tenths of degrees, or
-    ticks backwards. Raises ValueError naming what was expected.
+    A unit may have a number or sign before it: with `0.1C`, the wire counts tenths of degrees, and
+    with `-tick`, negative ticks. Raises ValueError with the expected units.
     """
     known = UNITS[quantity]
     match = _UNIT.fullmatch(unit)
@@ -120,11 +120,11 @@ def factor(quantity: str, unit: str, ticks_per_turn: float | None) -> float:
     if match is None or (name not in known and not (name == "" and not unit.strip())):
         choices = " or ".join(filter(None, known)) or "no unit"
         raise ValueError(f"it is a {quantity}: expected {choices}, got {unit!r}")
-    one = known[name] if name in known else next(iter(known.values()))
+    unit_factor = known[name] if name in known else next(iter(known.values()))
     if name.startswith("tick"):
         if not ticks_per_turn:
             raise ValueError(f"{name!r} needs `ticks_per_turn`")
-        one = math.tau / ticks_per_turn
+        unit_factor = math.tau / ticks_per_turn
     number = match[1] + "1" if match[1] in ("", "+", "-") else match[1]
     try:
         scale = float(number)
@@ -132,33 +132,33 @@ def factor(quantity: str, unit: str, ticks_per_turn: float | None) -> float:
         scale = 0.0
     if scale == 0.0:
         raise ValueError(f"expected a number other than 0 before the unit, got {unit!r}")
-    return scale * one
+    return scale * unit_factor
 
 
 @dataclass(frozen=True)
 class Field:
-    """One number of a line."""
+    """A number in a line."""
 
     name: str
     unit: str
     factor: float  # SI value / number on the wire
-    format: str  # for Python's format(); integers and hexadecimals are rounded first
-    pattern: str  # regular expression
+    format: str  # for Python's format(); values of d, x and X are rounded first
+    pattern: str  # regular expression of the number
 
     @property
-    def counts(self) -> bool:
-        """True for a counter or flags, whose size is not limited."""
+    def is_counter(self) -> bool:
+        """True for ticks or flags, whose value is not limited."""
         return self.unit.endswith("tick") or self.format[-1] in "xX"
 
     @property
     def step(self) -> float:
-        """The smallest difference of two values on the wire, in SI units."""
+        """The resolution on the wire, in SI units."""
         if self.format[-1] != "f":
             return abs(self.factor)
         return abs(self.factor) * 10.0 ** -_places(self.format)
 
     def write(self, value: float, *, toward_zero: bool = False) -> str:
-        """Return the text for a value in SI units, rounded to its digits; zero has no sign."""
+        """Return the text of a value in SI units, rounded to the format; zero has no sign."""
         wire = value / self.factor
         if toward_zero:
             places = 10.0 ** _places(self.format) if self.format[-1] == "f" else 1.0
@@ -169,14 +169,14 @@ class Field:
         return format(0.0, self.format) if float(text) == 0 else text
 
     def read(self, text: str) -> float:
-        """Return the value in SI units of a text that fits the pattern."""
+        """Return the value of a text, in SI units. The text must match the pattern."""
         return (int(text, 16) if self.format[-1] in "xX" else float(text)) * self.factor + 0.0
 
 
 def parse_field(
     name: str, unit: str | None, form: str | None, known: Mapping[str, str], turn: float | None
 ) -> Field:
-    """Return the field between two braces. Raises ValueError naming the field."""
+    """Return the field between two braces. Raises ValueError with the field's name."""
     if name in CHECKS:
         raise ValueError(f"the checksum {{{name}}} must stand last in the line")
     if name not in known:
@@ -204,7 +204,7 @@ def _places(form: str) -> int:
 
 
 def _pattern(form: str) -> str:
-    """Return the expression that matches exactly the numbers of this format."""
+    """Return a regular expression that matches exactly the numbers of this format."""
     sign = "[-+]" if form.startswith("+") else "-?"
     padding = " *" if len(form.rstrip("fdxX").partition(".")[0].lstrip("+0")) else ""
     if form[-1] in "xX":
@@ -216,9 +216,9 @@ def _pattern(form: str) -> str:
 
 
 class Template:
-    """One kind of line. Raises ValueError for an invalid text.
+    """A template of a line. Raises ValueError for an invalid text.
 
-    `known` maps its possible fields to their quantities.
+    `known` maps the possible fields to their quantities.
     """
 
     def __init__(
@@ -240,11 +240,11 @@ class Template:
             raise ValueError(f"there is no field in it; known: {', '.join(known)}")
         self._check_gaps()
         names = [field.name for field in self.fields if field.name != IGNORED]
-        twice = sorted({name for name in names if names.count(name) > 1})
-        if twice:
-            raise ValueError(f"{', '.join(twice)} stands in it twice")
+        repeated = sorted({name for name in names if names.count(name) > 1})
+        if repeated:
+            raise ValueError(f"{', '.join(repeated)} stands in it twice")
         self.names = frozenset(names)
-        self._expression = re.compile(self._regular())
+        self._expression = re.compile(self._line_pattern())
 
     def encode(self, values: Mapping[str, float], *, toward_zero: bool = False) -> bytes:
         """Return the line for values in SI units; a field without a value is 0."""
@@ -252,11 +252,11 @@ class Template:
         for field, after in zip(self.fields, self._texts[1:], strict=False):
             text += field.write(values.get(field.name, 0.0), toward_zero=toward_zero) + after
         if self.check:
-            text += self._sum(text)
+            text += self._checksum(text)
         return (text + self._tail).encode("ascii")
 
     def decode(self, line: bytes) -> dict[str, float] | None:
-        """Return the values of a line without its end, in SI units; None for another line."""
+        """Return the values of a line without its end, in SI units; None if it does not match."""
         if len(line) > MAX_LINE_BYTES or not line.isascii():
             return None
         text = line.decode("ascii")
@@ -265,28 +265,28 @@ class Template:
             return None
         if self.check:
             digits = CHECKS[self.check].digits
-            if text[-digits:].upper() != self._sum(text[:-digits]):
+            if text[-digits:].upper() != self._checksum(text[:-digits]):
                 return None
         pairs = zip(self.fields, match.groups(), strict=True)
         read = [(f, f.read(number)) for f, number in pairs if f.name != IGNORED]
-        if any(abs(value) > MAX_VALUE and not f.counts for f, value in read):
+        if any(abs(value) > MAX_VALUE and not f.is_counter for f, value in read):
             return None
         return {f.name: value for f, value in read}
 
     def sent(self, name: str, value: float) -> float:
-        """Return a commanded value [SI] as rounded on the line, towards zero."""
+        """Return a commanded value [SI] as rounded towards zero on the line."""
         for field in self.fields:
             if field.name == name:
                 return field.read(field.write(value, toward_zero=True))
         return value
 
     def reads_all_of(self, other: "Template") -> bool:
-        """Return whether this template matches all lines of the other one."""
-        nothing = other.encode({}).strip(b"\r\n")
-        return self.decode(nothing) is not None
+        """Return whether this template matches the lines of the other one."""
+        zeros = other.encode({}).strip(b"\r\n")
+        return self.decode(zeros) is not None
 
     def longest(self) -> int:
-        """Return the approximate number of bytes of a long line."""
+        """Return the approximate size of a long line [bytes]."""
         return len(self.encode({field.name: -5.0 * field.factor for field in self.fields}))
 
     def _check_gaps(self) -> None:
@@ -299,13 +299,13 @@ class Template:
                     "them that is no digit, such as a comma"
                 )
 
-    def _sum(self, text: str) -> str:
+    def _checksum(self, text: str) -> str:
         check = CHECKS[self.check]
         covered = text.removeprefix("$").removesuffix("*").encode("ascii")
         return format(check.of(covered), f"0{check.digits}X")
 
-    def _regular(self) -> str:
-        """Return the expression of a whole line; its groups are the numbers."""
+    def _line_pattern(self) -> str:
+        """Return the regular expression of a line; its groups are the numbers."""
         pattern = re.escape(self._texts[0])
         for field, after in zip(self.fields, self._texts[1:], strict=False):
             pattern += f"({field.pattern})" + re.escape(after)
@@ -325,7 +325,7 @@ def _check_text(text: str) -> None:
 
 
 def describe(values: Mapping[str, float]) -> str:
-    """Describe the numbers of a line, in SI units, volts, degrees C and percent."""
+    """Describe the values of a line, in SI units, volts, degrees C and percent."""
     words = []
     for name, value in values.items():
         quantity = {**STATE, **COMMAND}[name]
@@ -336,9 +336,9 @@ def describe(values: Mapping[str, float]) -> str:
 
 
 class LineDecoder:
-    """Splits bytes into lines and reads those that fit one of the templates.
+    """Splits bytes into lines, and decodes those that match a template.
 
-    `errors` counts other lines after the first valid one: the lines before are a boot banner. It
+    `errors` counts invalid lines after the first valid one; lines before it are a boot banner. It
     buffers at most MAX_LINE_BYTES.
     """
 
@@ -347,8 +347,8 @@ class LineDecoder:
         self._templates = templates
         self._end = templates[0].end
         self._rest = b""
-        self._skipping = False  # until the end of a too long line
-        self._begun = False
+        self._skipping = False  # True until the end of a line that is too long
+        self._after_banner = False  # True after a valid line
 
     def feed(self, data: bytes) -> list[dict[str, float]]:
         """Return the values of each valid line that `data` completes."""
@@ -360,21 +360,21 @@ class LineDecoder:
             elif (values := self._read(line)) is not None:
                 found.append(values)
         if len(rest) > MAX_LINE_BYTES:
-            self.errors += self._begun and not self._skipping
+            self.errors += self._after_banner and not self._skipping
             self._skipping, rest = True, b""
         self._rest = rest
         return found
 
     def clear(self) -> None:
         """Drop a partial line; the next lines may be a banner."""
-        self._rest, self._skipping, self._begun = b"", False, False
+        self._rest, self._skipping, self._after_banner = b"", False, False
 
     def _read(self, line: bytes) -> dict[str, float] | None:
         line = line.strip(b"\r\n")
         for template in self._templates:
             values = template.decode(line)
             if values is not None:
-                self._begun = True
+                self._after_banner = True
                 return values
-        self.errors += bool(line) and self._begun
+        self.errors += bool(line) and self._after_banner
         return None
