@@ -1,4 +1,4 @@
-"""Motion of a simulated body, on wheels or on legs, and the wear of its battery and motors."""
+"""Motion of a simulated body on wheels or legs, its battery's charge and its motors' heat."""
 
 import abc
 import math
@@ -19,7 +19,7 @@ from gigabrain_zenoh.errors import Unsupported
 
 HOUR_S = 3600.0
 
-VELOCITY_TICKS = 5  # velocity is a mean over 50 ms; shorter ones show encoder noise
+VELOCITY_TICKS = 5  # velocity is a mean over 50 ms, as a shorter one shows encoder noise
 REST = Twist(0.0, 0.0, 0.0)
 
 
@@ -32,7 +32,7 @@ class Charge(NamedTuple):
 
 
 class Battery:
-    """Counts charge. The open-circuit voltage is two straight lines of the charge."""
+    """Integrates the current. The open-circuit voltage is piecewise linear in the charge."""
 
     def __init__(self, config: SimBattery) -> None:
         self._config = config
@@ -46,20 +46,20 @@ class Battery:
 
     def read(self) -> Charge:
         """Return the board's report."""
-        config, share = self._config, self.left_ah / self._config.capacity_ah
-        if share > 0.5:
-            rest = config.nominal_voltage
-            rest += (2 * share - 1) * (config.full_voltage - config.nominal_voltage)
+        config, charge = self._config, self.left_ah / self._config.capacity_ah
+        if charge > 0.5:
+            voltage = config.nominal_voltage
+            voltage += (2 * charge - 1) * (config.full_voltage - config.nominal_voltage)
         else:
-            rest = config.empty_voltage
-            rest += 2 * share * (config.nominal_voltage - config.empty_voltage)
+            voltage = config.empty_voltage
+            voltage += 2 * charge * (config.nominal_voltage - config.empty_voltage)
         return Charge(
-            rest - self._current * config.internal_resistance_ohm, 100 * share, self._current
+            voltage - self._current * config.internal_resistance_ohm, 100 * charge, self._current
         )
 
 
 class MotorHeat:
-    """A motor's temperature: heated by its current squared, cooled by the air."""
+    """A motor's temperature: the squared current heats it, and the air cools it."""
 
     def __init__(self, config: SimMotor) -> None:
         self._config = config
@@ -87,7 +87,7 @@ class Motor(NamedTuple):
 
 
 class OdometryReading(NamedTuple):
-    """Pose and velocity by the body's own sensors, from (0, 0, 0) at the start."""
+    """Pose and velocity from the body's own sensors; the pose is (0, 0, 0) at the start."""
 
     x: float  # [m]
     y: float  # [m]
@@ -97,19 +97,19 @@ class OdometryReading(NamedTuple):
 
 
 class Locomotion(abc.ABC):
-    """The body's own firmware: commands to motors, sensors to odometry, without the truth.
+    """The body's own firmware: commands to motors, and sensors to odometry, without ground truth.
 
-    In each step of 10 ms, call `act` before the physics, `sense` and `wear` after it.
+    In each step of 10 ms, call `act` before the physics, and `sense` and `wear` after it.
     """
 
-    fallen = False  # whether the body lies on the floor
+    fallen = False  # True once the body lies on the floor
 
     @abc.abstractmethod
     def command(self, twist: Twist) -> Twist:
-        """Aim for a velocity; returns the one that the body can have."""
+        """Set the target velocity; return the one that the body can reach."""
 
     def walk(self, gait: Gait) -> None:
-        """Aim for a gait instead. Raises Unsupported for a body without legs."""
+        """Set the target gait instead. Raises Unsupported for a body without legs."""
         raise Unsupported("this body has no legs to walk on")
 
     @abc.abstractmethod
@@ -122,22 +122,22 @@ class Locomotion(abc.ABC):
 
     @abc.abstractmethod
     def wear(self) -> float:
-        """Heat the motors by the step's work; return the current that it took [A]."""
+        """Heat the motors by the past step; return their current [A]."""
 
     @abc.abstractmethod
     def odometry(self) -> OdometryReading:
-        """Pose and velocity."""
+        """Return pose and velocity."""
 
     @abc.abstractmethod
     def velocity(self) -> Twist:
-        """Return the measured velocity, sideways as well."""
+        """Return the measured velocity, with its lateral part."""
 
     @abc.abstractmethod
     def motors(self) -> tuple[Motor, ...]:
         """Return all driven joints."""
 
     def contacts(self) -> tuple[bool, ...]:
-        """Return which feet bear weight; none for a body without feet."""
+        """Return for each foot whether it bears weight; empty without feet."""
         return ()
 
 
@@ -145,7 +145,7 @@ class Fixed(Locomotion):
     """A base that is screwed to the floor."""
 
     def command(self, twist: Twist) -> Twist:
-        """Stay where it is."""
+        """Ignore the command."""
         return REST
 
     def act(self) -> None:
@@ -155,26 +155,26 @@ class Fixed(Locomotion):
         """Do nothing."""
 
     def wear(self) -> float:
-        """Return no current: it has no motors."""
+        """Return 0: there are no motors."""
         return 0.0
 
     def odometry(self) -> OdometryReading:
-        """Return the pose at which it is fixed."""
+        """Return the fixed pose."""
         return OdometryReading(0.0, 0.0, 0.0, 0.0, 0.0)
 
     def velocity(self) -> Twist:
-        """Return that it rests."""
+        """Return zero."""
         return REST
 
     def motors(self) -> tuple[Motor, ...]:
-        """Return none."""
+        """Return an empty tuple."""
         return ()
 
 
 class Wheels(Locomotion):
-    """Motors with encoders of wheels and steering. Wheels may slip.
+    """A wheeled base: motors and encoders of wheels and steering. Wheels may slip.
 
-    Wheels reach the commanded speed at their largest acceleration.
+    Wheels reach the commanded speed with the maximum acceleration.
     """
 
     def __init__(self, body: SimBody, model: mujoco.MjModel, data: mujoco.MjData) -> None:
@@ -184,16 +184,16 @@ class Wheels(Locomotion):
         self._motors = [int(model.actuator(f"{ROBOT}{n}").id) for n in body.wheels]
         self._heat = [MotorHeat(body.motor) for _ in body.wheels]
         self._angle_per_tick = math.tau / body.encoder_ticks
-        self._rolling = len(body.rolling)  # wheels come first, steering last
-        data.qpos[self._angles[: self._rolling]] = 0.0  # where their encoders begin
+        self._rolling = len(body.rolling)  # number of driven wheels, which precede the steering
+        data.qpos[self._angles[: self._rolling]] = 0.0  # encoders start at 0
         angles = data.qpos[self._angles].tolist()
-        self._target = self._speed = tuple(angles)  # [rad/s] of wheels; [rad] of steering
-        self._counts = tuple(self._counted(angle, 0) for angle in angles)
-        self._past = deque([self._counts] * (VELOCITY_TICKS + 1), maxlen=VELOCITY_TICKS + 1)
+        self._target = self._speed = tuple(angles)  # [rad/s] for wheels, [rad] for steering
+        self._counts = tuple(self._next_count(angle, 0) for angle in angles)
+        self._history = deque([self._counts] * (VELOCITY_TICKS + 1), maxlen=VELOCITY_TICKS + 1)
         self._x = self._y = self._yaw = 0.0
 
     def command(self, twist: Twist) -> Twist:
-        """Aim for a velocity; if a wheel would be too fast, all are scaled down."""
+        """Set the target velocity; if a wheel would be too fast, all are scaled down."""
         wheels = self._kinematics.to_wheels(twist)
         speeds = wheels[: self._rolling]
         scale = max(map(abs, speeds)) / self._body.max_wheel_speed
@@ -217,22 +217,22 @@ class Wheels(Locomotion):
         """Count the encoder ticks of the past step."""
         position = self._data.qpos
         self._counts = tuple(
-            self._counted(float(position[angle]), count)
+            self._next_count(float(position[angle]), count)
             for angle, count in zip(self._angles, self._counts, strict=True)
         )
-        self._past.append(self._counts)
+        self._history.append(self._counts)
 
-    def _counted(self, angle: float, count: int) -> int:
-        """Return the new count; with hysteresis, so that a wheel at rest does not flicker."""
+    def _next_count(self, angle: float, count: int) -> int:
+        """Return the new count, with hysteresis, so that it is constant for a wheel at rest."""
         return count + math.trunc(angle / self._angle_per_tick - count)
 
     def wear(self) -> float:
-        """Return the motors' current, from speed and torque [A]."""
+        """Heat the motors by speed and torque; return their current [A]."""
         config, effort, current = self._body, self._data.actuator_force.tolist(), 0.0
-        share = config.battery.drive_current_a / len(self._heat) / config.max_wheel_speed
+        per_speed = config.battery.drive_current_a / len(self._heat) / config.max_wheel_speed
         wheels = zip(self._heat, self._motors, self._speeds(self._angle_per_tick), strict=True)
         for heat, motor, speed in wheels:
-            current += heat.warm(share * abs(speed), effort[motor])
+            current += heat.warm(per_speed * abs(speed), effort[motor])
         return current
 
     def motors(self) -> tuple[Motor, ...]:
@@ -252,14 +252,14 @@ class Wheels(Locomotion):
         )
 
     def _speeds(self, per_tick: float) -> tuple[float, ...]:
-        """Return the speed of all motors, in units of `per_tick` a second."""
+        """Return the speed of all motors, in units of `per_tick` per second."""
         per_second = per_tick / (VELOCITY_TICKS * STEP_S)
-        pairs = zip(self._counts, self._past[0], strict=True)
-        return tuple((now - then) * per_second for now, then in pairs)
+        pairs = zip(self._counts, self._history[0], strict=True)
+        return tuple((now - before) * per_second for now, before in pairs)
 
 
 class Rolling(Wheels):
-    """A differential base: two wheels, left and right; nothing goes sideways."""
+    """A differential base with two wheels, left and right."""
 
     def __init__(self, body: SimBody, model: mujoco.MjModel, data: mujoco.MjData) -> None:
         super().__init__(body, model, data)
@@ -273,68 +273,68 @@ class Rolling(Wheels):
         left, right = self._counts
         moved = (left + right - before[0] - before[1]) / 2 * self._metres_per_tick
         yaw = (right - left) * self._metres_per_tick / self._body.wheel_separation
-        middle = (yaw + self._yaw) / 2
-        self._x += moved * math.cos(middle)
-        self._y += moved * math.sin(middle)
+        mid_heading = (yaw + self._yaw) / 2
+        self._x += moved * math.cos(mid_heading)
+        self._y += moved * math.sin(mid_heading)
         self._yaw = yaw
 
     def odometry(self) -> OdometryReading:
-        """Return pose and velocity by the wheel encoders alone."""
+        """Return pose and velocity from the wheel encoders alone."""
         left, right = self._speeds(self._metres_per_tick)
         turn = (right - left) / self._body.wheel_separation
         return OdometryReading(self._x, self._y, self._yaw, (left + right) / 2, turn)
 
     def velocity(self) -> Twist:
-        """Return the velocity by the wheel encoders alone."""
+        """Return the velocity from the wheel encoders alone."""
         odometry = self.odometry()
         return Twist(odometry.linear_x, 0.0, odometry.angular_z)
 
 
 class FreeRolling(Wheels):
-    """Any other base on wheels; if its wheels scrub, the gyroscope gives the heading."""
+    """Any other wheeled base; if its wheels scrub, the gyroscope gives the heading."""
 
     def __init__(self, body: SimBody, model: mujoco.MjModel, data: mujoco.MjData) -> None:
         super().__init__(body, model, data)
         self._scale = (body.odometry_wheel_radius or body.wheel_radius) / body.wheel_radius
-        self._turns: deque[float] = deque([0.0] * VELOCITY_TICKS, maxlen=VELOCITY_TICKS)  # [rad/s]
+        self._rates: deque[float] = deque([0.0] * VELOCITY_TICKS, maxlen=VELOCITY_TICKS)  # [rad/s]
 
     def sense(self, imu: ImuSample) -> None:
-        """Integrate the encoder ticks of the past step, or the gyroscope, at the mid heading."""
+        """Integrate encoder ticks, and perhaps the gyroscope, at the mid heading."""
         before = self._counts
         super().sense(imu)
         moved = self._body_motion(before, 1.0)
-        self._turns.append(imu.angular_velocity[2])
+        self._rates.append(imu.angular_velocity[2])
         turn = imu.angular_velocity[2] * STEP_S if self._body.gyro_heading else moved.angular_z
-        middle = self._yaw + turn / 2
-        cos, sin = math.cos(middle), math.sin(middle)
+        mid_heading = self._yaw + turn / 2
+        cos, sin = math.cos(mid_heading), math.sin(mid_heading)
         self._x += cos * moved.linear_x - sin * moved.linear_y
         self._y += sin * moved.linear_x + cos * moved.linear_y
         self._yaw += turn
 
     def odometry(self) -> OdometryReading:
-        """Return pose and velocity by encoders, and by the gyroscope if wheels scrub."""
+        """Return pose and velocity from encoders, and from the gyroscope if wheels scrub."""
         velocity = self.velocity()
         return OdometryReading(self._x, self._y, self._yaw, velocity.linear_x, velocity.angular_z)
 
     def velocity(self) -> Twist:
         """Return the mean velocity of the last 50 ms."""
-        moved = self._body_motion(self._past[0], VELOCITY_TICKS * STEP_S)
+        moved = self._body_motion(self._history[0], VELOCITY_TICKS * STEP_S)
         if not self._body.gyro_heading:
             return moved
-        turn = sum(self._turns) / len(self._turns)
+        turn = sum(self._rates) / len(self._rates)
         return moved._replace(angular_z=turn)
 
     def _body_motion(self, since: tuple[int, ...], seconds: float) -> Twist:
-        """Return the mean velocity since the counts `since`, over `seconds`."""
-        first, unit = self._rolling, self._angle_per_tick
-        pairs = zip(self._counts[:first], since[:first], strict=True)
-        rolled = [(now - then) * unit * self._scale / seconds for now, then in pairs]
-        steers = [count * unit for count in self._counts[first:]]
-        return self._kinematics.to_body((*rolled, *steers))
+        """Return the mean velocity since the encoder counts `since`, over `seconds`."""
+        wheels, unit = self._rolling, self._angle_per_tick
+        pairs = zip(self._counts[:wheels], since[:wheels], strict=True)
+        speeds = [(now - before) * unit * self._scale / seconds for now, before in pairs]
+        steering = [count * unit for count in self._counts[wheels:]]
+        return self._kinematics.to_body((*speeds, *steering))
 
 
 class Walking(Locomotion):
-    """Trots, controlled by the body's own sensors. Stands at the start."""
+    """A quadruped that trots, controlled by its own sensors. It stands at the start."""
 
     def __init__(self, body: SimQuadruped, model: mujoco.MjModel, data: mujoco.MjData) -> None:
         self._body, self._data = body, data
@@ -343,31 +343,31 @@ class Walking(Locomotion):
         self._motors = np.array([model.actuator(name).id for name in names])
         self._touch = np.array([model.sensor(f"{ROBOT}{leg}_contact").adr[0] for leg in LEGS])
         self._heat = [MotorHeat(body.motor) for _ in names]
-        self._radians = math.tau / body.encoder_ticks
+        self._angle_per_tick = math.tau / body.encoder_ticks
         self._gait = body.walker.to_gait(REST)
         height = self._gait.height
         self._targets = body.geometry.standing(height)
         standing = by_joint(self._targets)
         data.qpos[self._angles] = data.ctrl[self._motors] = standing
-        self._counts = [round(angle / self._radians) for angle in standing]
+        self._counts = [round(angle / self._angle_per_tick) for angle in standing]
         stiffness = float(model.actuator_gainprm[self._motors[0], 0])
         mass = float(model.body_subtreemass[model.body(f"{ROBOT}base").id])
         self._trot = Trot(body.geometry, mass, stiffness, height)
         self._senses: Senses | None = None
-        self._turned = 0.0  # [rad], not wrapped
+        self._yaw = 0.0  # [rad], not wrapped
 
     @property
     def fallen(self) -> bool:  # type: ignore[override]
-        """True once the body lies on the floor, by its own attitude."""
+        """True once the body lies on the floor, by its inertial unit."""
         return self._trot.fallen
 
     def command(self, twist: Twist) -> Twist:
-        """Aim for a velocity, by the walker's gait."""
+        """Set the gait for a velocity; return the velocity of that gait."""
         self._gait = self._body.walker.to_gait(twist)
         return self._body.walker.to_body(self._gait)
 
     def walk(self, gait: Gait) -> None:
-        """Aim for a gait from the next step on."""
+        """Set the gait from the next step on."""
         self._gait = gait
 
     def act(self) -> None:
@@ -377,15 +377,15 @@ class Walking(Locomotion):
         self._data.ctrl[self._motors] = by_joint(self._targets)
 
     def sense(self, imu: ImuSample) -> None:
-        """Combine encoders, feet and inertial unit into one sample."""
+        """Combine encoders, foot contacts and inertial unit into one sample."""
         angles = self._data.qpos[self._angles].tolist()
-        counts = [round(angle / self._radians) for angle in angles]
+        counts = [round(angle / self._angle_per_tick) for angle in angles]
         steps = zip(counts, self._counts, strict=True)
-        rates = [(now - before) * self._radians / STEP_S for now, before in steps]
+        rates = [(now - before) * self._angle_per_tick / STEP_S for now, before in steps]
         self._counts = counts
         forces = self._data.sensordata[self._touch].tolist()
         self._senses = Senses(
-            joints=by_leg([count * self._radians for count in counts]),
+            joints=by_leg([count * self._angle_per_tick for count in counts]),
             rates=by_leg(rates),
             contacts=tuple(force > self._body.contact_n for force in forces),
             orientation=imu.orientation,
@@ -393,37 +393,37 @@ class Walking(Locomotion):
             linear_acceleration=imu.linear_acceleration,
         )
         self._trot.sense(self._senses, STEP_S)
-        self._turned += self._trot.odometry.velocity.angular_z * STEP_S
+        self._yaw += self._trot.odometry.velocity.angular_z * STEP_S
 
     def wear(self) -> float:
         """Heat the windings by torque; add the joints' mechanical power to the current."""
         power, resistance = 0.0, self._body.motor.resistance_ohm
         rates = by_joint(self._senses.rates) if self._senses else [0.0] * len(self._heat)
         for heat, effort, rate in zip(self._heat, self._efforts(), rates, strict=True):
-            amperes = heat.warm(0.0, effort)
-            power += amperes * amperes * resistance + max(effort * rate, 0.0)
+            current = heat.warm(0.0, effort)
+            power += current * current * resistance + max(effort * rate, 0.0)
         return power / self._body.battery.nominal_voltage
 
     def odometry(self) -> OdometryReading:
-        """Return pose and velocity by legs and gyroscope."""
+        """Return pose and velocity from legs and gyroscope."""
         pose, velocity = self._trot.odometry.pose, self._trot.odometry.velocity
-        return OdometryReading(pose.x, pose.y, self._turned, velocity.linear_x, velocity.angular_z)
+        return OdometryReading(pose.x, pose.y, self._yaw, velocity.linear_x, velocity.angular_z)
 
     def velocity(self) -> Twist:
-        """Return the velocity by legs, accelerometer and gyroscope."""
+        """Return the velocity from legs, accelerometer and gyroscope."""
         return self._trot.odometry.velocity
 
     def motors(self) -> tuple[Motor, ...]:
-        """The twelve joints, leg by leg."""
+        """Return the twelve joints, leg by leg."""
         rates = by_joint(self._senses.rates) if self._senses else [0.0] * len(self._heat)
         parts = zip(JOINT_NAMES, self._counts, rates, self._efforts(), self._heat, strict=True)
         return tuple(
-            Motor(name, count * self._radians, rate, effort, heat.celsius)
+            Motor(name, count * self._angle_per_tick, rate, effort, heat.celsius)
             for name, count, rate, effort, heat in parts
         )
 
     def contacts(self) -> tuple[bool, ...]:
-        """Return the contacts in the order of LEGS."""
+        """Return whether each foot bears weight, in the order of LEGS."""
         return self._senses.contacts if self._senses else (False,) * len(LEGS)
 
     def _efforts(self) -> list[float]:
