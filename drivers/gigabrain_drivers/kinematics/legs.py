@@ -128,7 +128,7 @@ class Senses(NamedTuple):
 
     joints: tuple[Vector, ...]  # [rad], of each leg, from the encoders
     rates: tuple[Vector, ...]  # [rad/s], from the encoders
-    contacts: tuple[bool, ...]  # whether the foot bears weight
+    contacts: tuple[bool, ...]  # True if the foot bears weight
     orientation: Quaternion  # x, y, z, w; its yaw drifts and is not used
     angular_velocity: Vector  # [rad/s], in the body's frame
     linear_acceleration: Vector  # [m/s2], in the body's frame; 9.81 upward at rest
