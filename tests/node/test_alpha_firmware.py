@@ -1,4 +1,4 @@
-"""Alpha's emulated firmware alone, on a body that only remembers, in time that is counted."""
+"""Alpha's emulated firmware alone, on a body that only records its commands, in fake time."""
 
 import math
 from types import SimpleNamespace
@@ -31,14 +31,14 @@ STANDING = Snapshot(
 
 
 class Firmware:
-    """The device alone, on a body that only remembers what it was told, in time that is counted."""
+    """The emulated firmware, with its commands in `gaits`, and its time set by `step`."""
 
     def __init__(self) -> None:
         self.gaits: list[Gait] = []
         self.bytes = bytearray()
-        self.untaken: list[Snapshot] = []
+        self.waiting: list[Snapshot] = []
         self.body = SimpleNamespace(
-            snapshot=STANDING, walk=self.gaits.append, take_snapshots=self._fresh
+            snapshot=STANDING, walk=self.gaits.append, take_snapshots=self._take_snapshots
         )
         wire = SimpleNamespace(write=self._write)
         self.device = Alpha(self.body, AlphaOptions(driver="alpha"), wire)  # type: ignore[arg-type]
@@ -49,9 +49,9 @@ class Firmware:
         self.bytes += data
         return True
 
-    def _fresh(self) -> list[Snapshot]:
-        untaken, self.untaken = self.untaken, []
-        return untaken
+    def _take_snapshots(self) -> list[Snapshot]:
+        waiting, self.waiting = self.waiting, []
+        return waiting
 
     def step(self, milliseconds: int) -> State:
         self.now_ns += milliseconds * MS
@@ -67,7 +67,7 @@ class Firmware:
         self.device.feed(alpha.encode_walk(Walk(now, gait), sequence))
 
 
-def test_it_starts_standing_and_reports_what_it_measures() -> None:
+def test_it_starts_standing_and_reports_its_measurements() -> None:
     state = Firmware().step(10)
     assert (state.flags, state.echo, state.milliseconds) == (alpha.SILENT, 0, 10)
     assert state.voltage == 28.0
@@ -75,9 +75,9 @@ def test_it_starts_standing_and_reports_what_it_measures() -> None:
     assert state.temperatures == (30.0,) * 12
 
 
-def test_steps_in_which_it_was_held_up_are_reported_all_the_same() -> None:
+def test_steps_during_a_delay_are_reported_afterwards() -> None:
     firmware = Firmware()
-    firmware.untaken = [STANDING._replace(time_ns=ms * MS) for ms in (10, 20, 30)]
+    firmware.waiting = [STANDING._replace(time_ns=ms * MS) for ms in (10, 20, 30)]
     firmware.device.step(30 * MS)
     frames = AlphaDecoder().feed(bytes(firmware.bytes))
     reports = [alpha.decode_state(frame) for frame in frames]
@@ -85,7 +85,7 @@ def test_steps_in_which_it_was_held_up_are_reported_all_the_same() -> None:
     assert [frame.sequence for frame in frames] == [2, 3, 4]
 
 
-def test_its_clock_stands_still_while_its_body_does() -> None:
+def test_its_clock_stops_while_the_simulation_of_its_body_does() -> None:
     firmware = Firmware()
     firmware.step(10)
     firmware.bytes.clear()
@@ -96,7 +96,7 @@ def test_its_clock_stands_still_while_its_body_does() -> None:
     assert report.milliseconds == 10
 
 
-def test_it_walks_as_commanded_and_says_which_command_that_was() -> None:
+def test_it_walks_as_commanded_and_echoes_the_command() -> None:
     firmware = Firmware()
     firmware.walk(41)
     state = firmware.step(10)
@@ -112,7 +112,7 @@ def test_it_stops_100_ms_after_the_last_command_and_not_before() -> None:
     assert firmware.gaits[-1] == REST
 
 
-def test_what_is_refused_does_not_keep_it_walking() -> None:
+def test_refused_commands_do_not_keep_it_walking() -> None:
     firmware = Firmware()
     firmware.walk(5)
     firmware.step(60)
@@ -125,7 +125,7 @@ def test_what_is_refused_does_not_keep_it_walking() -> None:
     assert (state.flags, state.echo, state.refused) == (alpha.SILENT, 5, 5)
 
 
-def test_a_command_that_knows_only_an_old_state_is_refused() -> None:
+def test_a_command_based_on_an_old_state_is_refused() -> None:
     firmware = Firmware()
     firmware.step(1000)
     firmware.walk(1, seen=849)
@@ -141,7 +141,7 @@ def test_stop_is_always_obeyed() -> None:
     assert firmware.gaits[-1] == REST
 
 
-def test_after_silence_a_new_count_may_begin_anywhere() -> None:
+def test_after_silence_a_new_sequence_may_start_at_any_number() -> None:
     firmware = Firmware()
     firmware.walk(1000)
     firmware.step(200)
@@ -150,7 +150,7 @@ def test_after_silence_a_new_count_may_begin_anywhere() -> None:
 
 
 @given(st.lists(st.binary(max_size=80), max_size=20))
-def test_no_bytes_make_it_walk_or_end(pieces: list[bytes]) -> None:
+def test_random_bytes_never_make_it_walk_or_raise(pieces: list[bytes]) -> None:
     firmware = Firmware()
     for piece in pieces:
         firmware.device.feed(piece)
@@ -159,7 +159,7 @@ def test_no_bytes_make_it_walk_or_end(pieces: list[bytes]) -> None:
     assert set(firmware.gaits) == {REST}
 
 
-def test_it_parks_through_silence_and_stands_up_before_it_walks() -> None:
+def test_it_stays_parked_after_silence_and_stands_up_before_it_walks() -> None:
     firmware = Firmware()
     firmware.walk(1)
     firmware.device.feed(alpha.encode_park(2))

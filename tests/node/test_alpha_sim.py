@@ -1,4 +1,4 @@
-"""Alpha by `--link sim`: the MuJoCo driver with a quadruped in it."""
+"""Alpha with `--link sim`: the MuJoCo driver with a quadruped."""
 
 from collections.abc import AsyncIterator
 from pathlib import Path
@@ -13,14 +13,14 @@ from gigabrain_zenoh.clock import Clock
 from gigabrain_zenoh.errors import BodyLost
 
 
-def make() -> MujocoDriver:
+def make_driver() -> MujocoDriver:
     _, driver = catalog.make_driver("alpha", Run(folder=Path(), world="arena", speed=100.0))
     assert isinstance(driver, MujocoDriver)
     return driver
 
 
 async def test_it_walks_sideways_and_reports_joints_and_odometry() -> None:
-    driver = make()
+    driver = make_driver()
     async with driver:
         ticks = driver.ticks(Clock())
         for _ in range(150):
@@ -36,8 +36,8 @@ async def test_it_walks_sideways_and_reports_joints_and_odometry() -> None:
     assert driver.report()["contacts"] == 0
 
 
-async def test_it_comes_to_rest_by_itself_when_nobody_commands_it() -> None:
-    driver = make()
+async def test_it_comes_to_rest_without_commands() -> None:
+    driver = make_driver()
     async with driver:
         ticks = driver.ticks(Clock())
         for _ in range(60):
@@ -51,7 +51,7 @@ async def test_it_comes_to_rest_by_itself_when_nobody_commands_it() -> None:
 
 
 async def test_a_body_that_has_fallen_over_is_lost() -> None:
-    driver = make()
+    driver = make_driver()
     async with driver:
         ticks = driver.ticks(Clock())
         await anext(ticks)
@@ -66,7 +66,7 @@ async def _drain(ticks: AsyncIterator[int]) -> None:
         await anext(ticks)
 
 
-def test_its_file_says_what_the_others_may_know() -> None:
+def test_its_file_has_its_speed_limits_and_drive_type() -> None:
     robot = catalog.load_robot("alpha")
     assert (robot.max_linear_speed, robot.max_lateral_speed) == (0.5, 0.2)
     assert robot.max_angular_speed == 1.0

@@ -114,7 +114,7 @@ def test_a_gait_beyond_the_limits_is_invalid(wrong: dict[str, object]) -> None:
     assert not is_valid_gait(WALKER.to_gait(Twist(0.3, 0.0, 0.0))._replace(**wrong))  # type: ignore[arg-type]
 
 
-def walked(twist: Twist, seconds: float, lifted: tuple[int, ...] = ()) -> LegOdometry:
+def odometry_after(twist: Twist, seconds: float, lifted: tuple[int, ...] = ()) -> LegOdometry:
     """Return the odometry of a body that moves at `twist`, with the feet `lifted` in the air."""
     odometry, passed = LegOdometry(GEOMETRY), 0.01
     contacts = tuple(leg not in lifted for leg in range(4))
@@ -143,18 +143,18 @@ def _rates(columns: tuple[Vector, ...], wanted: Vector, radius: float) -> Vector
 
 
 def test_feet_on_the_floor_measure_the_velocity() -> None:
-    odometry = walked(Twist(0.2, 0.0, 0.0), 1.0)
+    odometry = odometry_after(Twist(0.2, 0.0, 0.0), 1.0)
     assert odometry.velocity == pytest.approx((0.2, 0.0, 0.0), abs=1e-3)
     assert odometry.pose.x == pytest.approx(0.2, abs=0.02)
 
 
 def test_feet_in_the_air_measure_no_velocity() -> None:
-    odometry = walked(Twist(0.2, 0.0, 0.0), 1.0, lifted=(0, 1, 2, 3))
+    odometry = odometry_after(Twist(0.2, 0.0, 0.0), 1.0, lifted=(0, 1, 2, 3))
     assert odometry.velocity == pytest.approx((0.0, 0.0, 0.0), abs=1e-9)
 
 
 def test_turning_on_the_spot_does_not_change_the_position() -> None:
-    odometry = walked(Twist(0.0, 0.0, 0.8), 1.0, lifted=(0, 3))
+    odometry = odometry_after(Twist(0.0, 0.0, 0.8), 1.0, lifted=(0, 3))
     assert (odometry.pose.x, odometry.pose.y) == pytest.approx((0.0, 0.0), abs=1e-3)
     assert odometry.pose.yaw == pytest.approx(0.8, abs=1e-9)
 
