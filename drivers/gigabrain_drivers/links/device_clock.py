@@ -13,10 +13,10 @@ MIN_WINDOW_SHARE = 0.8  # once this share of it has passed
 SILENCE_MS = 500.0  # after a longer silence, the device may have restarted;
 RESTART_MS = 1000.0  # it did, if its data would otherwise be later by more than this
 LATE_MS = 50.0  # drift is not measured while the delay is longer
-MAX_DRIFT = 0.01  # of the two clocks; an RC oscillator may drift as much
+MAX_DRIFT = 0.01  # between the two clocks; an RC oscillator may drift as much
 EARLY_MS = 100.0  # data may arrive too early by this, after a delay of the host
 MAX_INVALID = 3  # the clock counts as new after this many impossible stamps in a row
-DRIFT_PERIOD_NS, MAX_DRIFT_SAMPLES = 1_000_000_000, 120  # the offset is sampled to measure drift
+DRIFT_PERIOD_NS, MAX_DRIFT_SAMPLES = 1_000_000_000, 120  # of the offset, to measure drift
 MIN_DRIFT_SAMPLES = 10
 
 

@@ -257,15 +257,15 @@ def _nothing() -> None:
 class Liveness:
     """Watches whether a body still sends its reports; logs each change once.
 
-    The body counts as lost after `silent_ns` without a message. The text `senseless` is logged if
-    the line works, but no message is valid. A short silence is not logged; the gate reports it.
+    The body counts as lost after `silent_ns` without a message. The text `no_message` is logged if
+    the line itself works. A short silence is not logged; the gate reports it.
     """
 
     def __init__(
-        self, link: Link, clock: Clock, silent_ns: int, senseless: str, log: logging.Logger
+        self, link: Link, clock: Clock, silent_ns: int, no_message: str, log: logging.Logger
     ) -> None:
         self._link, self._clock = link, clock
-        self._silent_ns, self._senseless = silent_ns, senseless
+        self._silent_ns, self._no_message = silent_ns, no_message
         self._received_ns: int | None = None  # None: no message since the line was opened or lost
         self._silent_since_ns = clock.now_ns()
         self._lost = False  # True after a loss, until the next message
@@ -299,5 +299,5 @@ class Liveness:
         return alive
 
     def _problem(self) -> str:
-        problem, name = self._link.problem or self._senseless, str(self._link)
+        problem, name = self._link.problem or self._no_message, str(self._link)
         return problem if name in problem else f"{name}: {problem}"

@@ -39,8 +39,8 @@ class TcpLink(Link):
         loop = asyncio.get_running_loop()
         try:
             async with asyncio.timeout(CONNECT_TIMEOUT_S):
-                found = await loop.getaddrinfo(self._host, self._port, type=socket.SOCK_STREAM)
-                self._socket = await _first_connected(found, CONNECT_TIMEOUT_S / len(found))
+                addresses = await loop.getaddrinfo(self._host, self._port, type=socket.SOCK_STREAM)
+                self._socket = await _first_connected(addresses, CONNECT_TIMEOUT_S / len(addresses))
         except TimeoutError:
             raise LinkProblem(f"no answer from {self}: is it switched on?") from None
         except (socket.gaierror, UnicodeError) as error:
@@ -69,30 +69,30 @@ class AddressLink(TcpLink):
     The file is read for each connection, because an emulator may use another port after a restart.
     """
 
-    def __init__(self, where: str, clock: Clock) -> None:
+    def __init__(self, target: str, clock: Clock) -> None:
         super().__init__("", 0, clock)
-        self._where = where
-        if "/" not in where:
-            self._host, self._port = address(where)
+        self._target = target
+        if "/" not in target:
+            self._host, self._port = address(target)
 
     def __str__(self) -> str:
-        return f"{self._host}:{self._port}" if self._host else self._where
+        return f"{self._host}:{self._port}" if self._host else self._target
 
     async def _connect(self) -> int:
-        if "/" in self._where:
-            self._host, self._port = read_address(Path(self._where))
+        if "/" in self._target:
+            self._host, self._port = read_address(Path(self._target))
         return await super()._connect()
 
 
-async def _first_connected(found: Sequence[AddressInfo], within_s: float) -> socket.socket:
+async def _first_connected(addresses: Sequence[AddressInfo], timeout_s: float) -> socket.socket:
     """Return a socket connected to the first address that answers. Raises OSError."""
     loop, problem = asyncio.get_running_loop(), OSError(errno.EADDRNOTAVAIL, "no address")
-    for family, kind, protocol, _, where in found:
+    for family, kind, protocol, _, sockaddr in addresses:
         candidate = socket.socket(family, kind, protocol)
         candidate.setblocking(False)
         try:
-            async with asyncio.timeout(within_s):
-                await loop.sock_connect(candidate, where)
+            async with asyncio.timeout(timeout_s):
+                await loop.sock_connect(candidate, sockaddr)
         except OSError as error:  # includes timeouts
             candidate.close()
             problem = error

@@ -132,8 +132,8 @@ async def test_the_log_has_the_same_lines_at_debug_level(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     caplog.set_level(logging.DEBUG, links.__name__)
-    async with bench(tmp_path) as it:
-        await it.drive(0.1, 0.2)
+    async with bench(tmp_path) as line:
+        await line.drive(0.1, 0.2)
     sent = f"{tmp_path}/base tx 56 2c 30 2e 32 30 30 2c 30 2e 30 30 30 0a  linear_x 0.2 m/s"
     assert any(message.startswith(sent) for message in caplog.messages)
 
