@@ -84,12 +84,12 @@ def test_an_lds01_packet_with_missing_bytes_is_dropped() -> None:
 
 
 def test_noise_does_not_fill_the_decoders() -> None:
-    one, three = lds01.Lds01Decoder(), lds03.Lds03Decoder()
+    decoder01, decoder03 = lds01.Lds01Decoder(), lds03.Lds03Decoder()
     for _ in range(20):
-        one.feed(b"\xfa\xa0" * 2000)
-        three.feed(b"\xaa\x55\x00\xff\x01\x00\x01" * 500)
-    assert len(one._buffer) < 50
-    assert len(three._buffer) < 800
+        decoder01.feed(b"\xfa\xa0" * 2000)
+        decoder03.feed(b"\xaa\x55\x00\xff\x01\x00\x01" * 500)
+    assert len(decoder01._buffer) < 50
+    assert len(decoder03._buffer) < 800
 
 
 def test_lds03_commands_are_those_of_the_vendor() -> None:
@@ -113,9 +113,9 @@ def test_an_lds03_packet_has_its_angles() -> None:
 
 
 def test_lds03_angles_wrap_at_zero() -> None:
-    two = (lds03.Lds03Sample(359.0, 500, 50, False), lds03.Lds03Sample(1.0, 500, 50, False))
-    three = (two[0], lds03.Lds03Sample(0.0, 500, 50, False), two[1])
-    (packet,) = lds03.Lds03Decoder().feed(lds03.encode(lds03.Lds03Packet(False, 0.0, three)))
+    first, last = (lds03.Lds03Sample(angle, 500, 50, False) for angle in (359.0, 1.0))
+    sent = (first, lds03.Lds03Sample(0.0, 500, 50, False), last)
+    (packet,) = lds03.Lds03Decoder().feed(lds03.encode(lds03.Lds03Packet(False, 0.0, sent)))
     assert [sample.angle for sample in packet.samples] == [359.0, 0.0, 1.0]
 
 

@@ -101,29 +101,29 @@ async def choose_mode(lidar: "Rplidar", info: Info, scan_mode: str) -> tuple[int
     if info.firmware < CONF_FIRMWARE and info.model >> 4 < CONF_FAMILY:
         return _old_mode(info, scan_mode), 0
     wanted = set(FORMATS) if scan_mode == "auto" else {KINDS[scan_mode]}
-    typical = _number(await _conf(lidar, rplidar.MODE_TYPICAL))
-    kind = await _kind(lidar, typical)
+    typical = _unsigned(await _read_conf(lidar, rplidar.MODE_TYPICAL))
+    kind = await _answer_type(lidar, typical)
     if kind in wanted:
         return kind, typical
-    fitting = []
-    for mode in range(_number(await _conf(lidar, rplidar.MODE_COUNT))):
-        if (kind := await _kind(lidar, mode)) in wanted:
-            period = _number(await _conf(lidar, rplidar.MODE_MICROSECONDS, mode))
-            fitting.append((period, kind, mode))
-    if not fitting:
+    candidates = []
+    for mode in range(_unsigned(await _read_conf(lidar, rplidar.MODE_COUNT))):
+        if (kind := await _answer_type(lidar, mode)) in wanted:
+            period = _unsigned(await _read_conf(lidar, rplidar.MODE_MICROSECONDS, mode))
+            candidates.append((period, kind, mode))
+    if not candidates:
         raise StartupError(f"this RPLIDAR has no scan_mode {scan_mode!r} that is understood here")
-    return min(fitting)[1:]
+    return min(candidates)[1:]
 
 
 def _old_mode(info: Info, scan_mode: str) -> int:
     """Return the answer type for firmware that does not report its modes."""
-    has = {"standard": rplidar.STANDARD}
+    supported = {"standard": rplidar.STANDARD}
     if info.firmware >= EXPRESS_FIRMWARE:
-        has |= {"auto": rplidar.EXPRESS, "express": rplidar.EXPRESS}
-    if scan_mode not in {*has, "auto"}:
+        supported |= {"auto": rplidar.EXPRESS, "express": rplidar.EXPRESS}
+    if scan_mode not in {*supported, "auto"}:
         version = ".".join(map(str, info.firmware))
         raise StartupError(f"this RPLIDAR's firmware {version} has no scan_mode {scan_mode!r}")
-    return has.get(scan_mode, rplidar.STANDARD)
+    return supported.get(scan_mode, rplidar.STANDARD)
 
 
 async def _stop(lidar: "Rplidar") -> None:
@@ -151,11 +151,11 @@ async def _check_health(lidar: "Rplidar") -> None:
         )
 
 
-async def _kind(lidar: "Rplidar", mode: int) -> int:
-    return (await _conf(lidar, rplidar.MODE_ANSWER, mode))[0]
+async def _answer_type(lidar: "Rplidar", mode: int) -> int:
+    return (await _read_conf(lidar, rplidar.MODE_ANSWER, mode))[0]
 
 
-async def _conf(lidar: "Rplidar", key: int, mode: int | None = None) -> bytes:
+async def _read_conf(lidar: "Rplidar", key: int, mode: int | None = None) -> bytes:
     """Return the value of a setting, at least one byte. Raises StartupError."""
     data = await lidar.ask(rplidar.conf_request(key, mode), rplidar.CONF)
     if int.from_bytes(data[:4], "little") != key or len(data) < 5:
@@ -163,7 +163,7 @@ async def _conf(lidar: "Rplidar", key: int, mode: int | None = None) -> bytes:
     return data[4:]
 
 
-def _number(data: bytes) -> int:
+def _unsigned(data: bytes) -> int:
     return int.from_bytes(data, "little")
 
 
@@ -286,8 +286,8 @@ class Rplidar(SerialSource):
             major, minor = info.firmware
             model = FAMILIES.get(info.model >> 4, f"model 0x{info.model:02x}")
             log.info("RPLIDAR %s on %s, firmware %d.%02d", model, self.link, major, minor)
-            named = MODELS.get(self.options.model)
-            if named and named.family != info.model >> 4:
+            expected = MODELS.get(self.options.model)
+            if expected and expected.family != info.model >> 4:
                 log.warning(
                     "the lidar on %s is an RPLIDAR %s, not model: %s",
                     self.link, model, self.options.model,
