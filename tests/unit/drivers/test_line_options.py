@@ -63,10 +63,10 @@ def test_a_mistake_is_refused_with_file_line_and_field(
     tmp_path: Path, right: str, wrong: str, complaint: str
 ) -> None:
     assert right in BARE
-    mine = tmp_path / "robot.yaml"
-    mine.write_text(BARE.replace(right, wrong))
+    file = tmp_path / "robot.yaml"
+    file.write_text(BARE.replace(right, wrong))
     with pytest.raises(ConfigError, match=r"robot\.yaml" + complaint):
-        catalog.make_driver(str(mine), Run(folder=tmp_path, link="real"))
+        catalog.make_driver(str(file), Run(folder=tmp_path, link="real"))
 
 
 @pytest.mark.parametrize(
@@ -89,14 +89,14 @@ def test_a_command_that_does_not_fit_the_body_is_refused(
 ) -> None:
     text = BARE.replace("{linear_x:.3f},{angular_z:.3f}", command)
     with pytest.raises(ConfigError, match=r"robot\.yaml:12: real\.command: " + complaint):
-        loaded(tmp_path, text)
+        load(tmp_path, text)
 
 
 @pytest.mark.parametrize(
     "command", ["{linear_x|mm/s:d},{linear_y},{angular_z}", "{linear_x:+.2f}{angular_z:+.2f}"]
 )
 def test_a_command_that_fits_the_body_is_accepted(tmp_path: Path, command: str) -> None:
-    loaded(tmp_path, BARE.replace("{linear_x:.3f},{angular_z:.3f}", command))
+    load(tmp_path, BARE.replace("{linear_x:.3f},{angular_z:.3f}", command))
 
 
 @pytest.mark.parametrize(
@@ -115,7 +115,7 @@ def test_a_state_without_the_bodys_motion_is_refused(
     tmp_path: Path, state: list[str], complaint: str
 ) -> None:
     with pytest.raises(ConfigError, match=r"robot\.yaml:13: real\.state" + complaint):
-        loaded(tmp_path, with_state(state))
+        load(tmp_path, with_state(state))
 
 
 @pytest.mark.parametrize(
@@ -128,7 +128,7 @@ def test_a_state_without_the_bodys_motion_is_refused(
     ],
 )
 def test_a_state_with_the_bodys_motion_is_accepted(tmp_path: Path, state: list[str]) -> None:
-    loaded(tmp_path, with_state(state))
+    load(tmp_path, with_state(state))
 
 
 @pytest.mark.parametrize(
@@ -162,13 +162,13 @@ def test_fields_that_do_not_fit_together_are_refused_with_file_and_line(
 ) -> None:
     assert right in BARE
     with pytest.raises(ConfigError, match=r"robot\.yaml" + complaint):
-        loaded(tmp_path, BARE.replace(right, wrong, 1))
+        load(tmp_path, BARE.replace(right, wrong, 1))
 
 
-def loaded(folder: Path, text: str) -> None:
-    mine = folder / "robot.yaml"
-    mine.write_text(text)
-    catalog.make_driver(str(mine), Run(folder=folder, link="real"))
+def load(folder: Path, text: str) -> None:
+    file = folder / "robot.yaml"
+    file.write_text(text)
+    catalog.make_driver(str(file), Run(folder=folder, link="real"))
 
 
 def with_state(lines: list[str]) -> str:
@@ -220,10 +220,10 @@ def test_the_emulated_link_is_the_real_link_on_other_ports() -> None:
 
 
 def test_an_emulated_section_may_name_its_ports(tmp_path: Path) -> None:
-    mine = tmp_path / "robot.yaml"
+    file = tmp_path / "robot.yaml"
     text = BARE.replace("real:", "emulated:").replace('"{port}"', '"{emulator}/uart"')
-    mine.write_text(text)
+    file.write_text(text)
     run = Run(folder=tmp_path, link="emulated", emulator="/run/ports")
-    _, _, options, _ = catalog.load_link(str(mine), run)
+    _, _, options, _ = catalog.load_link(str(file), run)
     assert isinstance(options, LineOptions)
     assert options.port == "/run/ports/uart"

@@ -30,7 +30,7 @@ TWO_LINES = LineOptions(
 )
 
 
-def report(options: LineOptions = OPTIONS) -> LineReport:
+def make_report(options: LineOptions = OPTIONS) -> LineReport:
     return LineReport(options, ROBOT, wheels_of(ROBOT))
 
 
@@ -39,57 +39,57 @@ def wheels(left: float, right: float) -> dict[str, float]:
 
 
 def test_wheels_that_turn_alike_move_the_body_straight() -> None:
-    it = report()
-    it.update(wheels(1.0, 1.0), 20 * MS)
+    report = make_report()
+    report.update(wheels(1.0, 1.0), 20 * MS)
     for n in range(1, 11):
-        it.update(wheels(1.0 + 0.05 * n, 1.0 + 0.05 * n), (20 + 20 * n) * MS)
-    assert (it.pose.x, it.pose.y, it.pose.yaw) == pytest.approx((0.04, 0.0, 0.0))
-    assert it.velocity().linear_x == pytest.approx(0.2)
-    assert it.joints(0)[0].position == pytest.approx(0.5)
+        report.update(wheels(1.0 + 0.05 * n, 1.0 + 0.05 * n), (20 + 20 * n) * MS)
+    assert (report.pose.x, report.pose.y, report.pose.yaw) == pytest.approx((0.04, 0.0, 0.0))
+    assert report.velocity().linear_x == pytest.approx(0.2)
+    assert report.joints(0)[0].position == pytest.approx(0.5)
 
 
 def test_counters_may_wrap() -> None:
-    it = report(replace(OPTIONS, tick_bits=16))
-    it.update(wheels(32760 * TICK, 32760 * TICK), 20 * MS)
-    it.update(wheels(-32760 * TICK, -32760 * TICK), 40 * MS)
-    assert it.pose.x == pytest.approx(16 * TICK * 0.08)
+    report = make_report(replace(OPTIONS, tick_bits=16))
+    report.update(wheels(32760 * TICK, 32760 * TICK), 20 * MS)
+    report.update(wheels(-32760 * TICK, -32760 * TICK), 40 * MS)
+    assert report.pose.x == pytest.approx(16 * TICK * 0.08)
 
 
 def test_a_jump_of_the_counters_is_no_motion() -> None:
-    it = report()
-    it.update(wheels(10.0, 10.0), 20 * MS)
-    it.update(wheels(0.0, 0.0), 40 * MS)
-    it.update(wheels(0.05, 0.05), 60 * MS)
-    assert it.pose.x == pytest.approx(0.004)
+    report = make_report()
+    report.update(wheels(10.0, 10.0), 20 * MS)
+    report.update(wheels(0.0, 0.0), 40 * MS)
+    report.update(wheels(0.05, 0.05), 60 * MS)
+    assert report.pose.x == pytest.approx(0.004)
 
 
 @pytest.mark.parametrize("delayed_lines", [1, 4, 10])
 def test_lines_that_arrive_together_count_as_lines_in_time(delayed_lines: int) -> None:
-    it, turn = report(replace(OPTIONS, state_hz=20.0)), ROBOT.max_angular_speed
+    report, turn = make_report(replace(OPTIONS, state_hz=20.0)), ROBOT.max_angular_speed
     base = wheels_of(ROBOT)
     assert base
     left, right = base.to_wheels(Twist(0.0, 0.0, turn))
     for n in range(41):  # `delayed_lines` lines from line 10 on arrive in one read
         read = 10 + delayed_lines if 10 <= n < 10 + delayed_lines else n
-        it.update(wheels(0.05 * n * left, 0.05 * n * right), (20 + 50 * read) * MS)
-    assert it.pose.yaw == pytest.approx(math.remainder(2.0 * turn, math.tau))
+        report.update(wheels(0.05 * n * left, 0.05 * n * right), (20 + 50 * read) * MS)
+    assert report.pose.yaw == pytest.approx(math.remainder(2.0 * turn, math.tau))
 
 
 def test_a_jump_of_the_counters_is_no_motion_in_lines_that_arrive_together() -> None:
-    it = report()
-    it.update(wheels(0.0, 0.0), 20 * MS)
+    report = make_report()
+    report.update(wheels(0.0, 0.0), 20 * MS)
     for angle in (0.05, 0.1, 10.0, 0.15, 0.2):  # after 0.1 s; one number is wrong
-        it.update(wheels(angle, angle), 120 * MS)
-    assert it.pose.x == pytest.approx(0.15 * 0.08)
-    it.update(wheels(0.2, 0.2), 220 * MS)
-    it.update(wheels(2.0, 2.0), 240 * MS)  # not delayed: too fast for 20 ms
-    assert it.pose.x == pytest.approx(0.15 * 0.08)
+        report.update(wheels(angle, angle), 120 * MS)
+    assert report.pose.x == pytest.approx(0.15 * 0.08)
+    report.update(wheels(0.2, 0.2), 220 * MS)
+    report.update(wheels(2.0, 2.0), 240 * MS)  # not delayed: too fast for 20 ms
+    assert report.pose.x == pytest.approx(0.15 * 0.08)
 
 
 def test_after_a_gap_the_shorter_motion_is_used() -> None:
-    rolled, restarted = report(), report()
-    for it in (rolled, restarted):
-        it.update(wheels(5.0, 5.0), 20 * MS)
+    rolled, restarted = make_report(), make_report()
+    for report in (rolled, restarted):
+        report.update(wheels(5.0, 5.0), 20 * MS)
     rolled.update(wheels(5.5, 5.5), 320 * MS)
     restarted.update(wheels(0.1, 0.1), 320 * MS)
     assert rolled.pose.x == pytest.approx(0.04)
@@ -97,52 +97,52 @@ def test_after_a_gap_the_shorter_motion_is_used() -> None:
 
 
 def test_the_pose_follows_the_firmwares_pose_from_its_first_value() -> None:
-    it = report()
-    it.update({"x": 5.0, "y": 1.0, "yaw": math.pi / 2}, 20 * MS)
-    it.update({"x": 5.0, "y": 1.01, "yaw": math.pi / 2}, 40 * MS)
-    assert (it.pose.x, it.pose.y) == pytest.approx((0.01, 0.0))
-    it.update({"x": 0.0, "y": 0.0, "yaw": 0.0}, 500 * MS)  # restarted
-    assert (it.pose.x, it.pose.y) == pytest.approx((0.01, 0.0))
+    report = make_report()
+    report.update({"x": 5.0, "y": 1.0, "yaw": math.pi / 2}, 20 * MS)
+    report.update({"x": 5.0, "y": 1.01, "yaw": math.pi / 2}, 40 * MS)
+    assert (report.pose.x, report.pose.y) == pytest.approx((0.01, 0.0))
+    report.update({"x": 0.0, "y": 0.0, "yaw": 0.0}, 500 * MS)  # restarted
+    assert (report.pose.x, report.pose.y) == pytest.approx((0.01, 0.0))
 
 
 def test_a_reported_velocity_is_integrated_without_positions() -> None:
-    it = report()
+    report = make_report()
     for n in range(1, 52):
-        it.update({"linear_x": 0.1, "angular_z": 0.0}, 20 * n * MS)
-    assert it.pose.x == pytest.approx(0.1)
-    assert it.velocity().linear_x == 0.1
+        report.update({"linear_x": 0.1, "angular_z": 0.0}, 20 * n * MS)
+    assert report.pose.x == pytest.approx(0.1)
+    assert report.velocity().linear_x == 0.1
 
 
 def test_the_velocity_follows_from_wheel_speeds() -> None:
-    it = report()
-    it.update({"wheel_left_velocity": 1.0, "wheel_right_velocity": 2.0}, 20 * MS)
-    assert it.velocity().linear_x == pytest.approx(0.12)
-    assert it.velocity().angular_z == pytest.approx(0.16)
+    report = make_report()
+    report.update({"wheel_left_velocity": 1.0, "wheel_right_velocity": 2.0}, 20 * MS)
+    assert report.velocity().linear_x == pytest.approx(0.12)
+    assert report.velocity().angular_z == pytest.approx(0.16)
 
 
 def test_wheel_speeds_are_integrated_without_positions() -> None:
-    it = report()
+    report = make_report()
     for n in range(1, 52):
-        it.update({"wheel_left_velocity": 1.0, "wheel_right_velocity": 2.0}, 20 * n * MS)
-    assert it.pose.yaw == pytest.approx(0.16)
-    assert it.pose.x == pytest.approx(0.75 * math.sin(0.16), abs=1e-4)  # 0.12 / 0.16 m of radius
-    assert it.joints(0)[1].position == pytest.approx(2.0)
+        report.update({"wheel_left_velocity": 1.0, "wheel_right_velocity": 2.0}, 20 * n * MS)
+    assert report.pose.yaw == pytest.approx(0.16)
+    assert report.pose.x == pytest.approx(0.75 * math.sin(0.16), abs=1e-4)  # radius 0.12 / 0.16 m
+    assert report.joints(0)[1].position == pytest.approx(2.0)
 
 
 def test_wheel_speeds_may_be_in_different_lines() -> None:
-    it = report()
+    report = make_report()
     for n in range(1, 52):
-        it.update({"wheel_left_velocity": 1.0}, (20 * n - 10) * MS)
-        it.update({"wheel_right_velocity": 1.0}, 20 * n * MS)
-    assert (it.pose.x, it.pose.yaw) == pytest.approx((0.08, 0.0), abs=0.001)
+        report.update({"wheel_left_velocity": 1.0}, (20 * n - 10) * MS)
+        report.update({"wheel_right_velocity": 1.0}, 20 * n * MS)
+    assert (report.pose.x, report.pose.yaw) == pytest.approx((0.08, 0.0), abs=0.001)
 
 
 def test_each_part_of_the_velocity_has_its_own_source() -> None:
-    it = report()
+    report = make_report()
     for n in range(11):
-        it.update({"linear_x": 0.25, **wheels(0.0, 0.05 * n)}, (20 + 20 * n) * MS)
-    assert it.velocity().linear_x == 0.25
-    assert it.velocity().angular_z == pytest.approx(0.4)  # 2.5 rad/s * 0.08 / 0.5
+        report.update({"linear_x": 0.25, **wheels(0.0, 0.05 * n)}, (20 + 20 * n) * MS)
+    assert report.velocity().linear_x == 0.25
+    assert report.velocity().angular_z == pytest.approx(0.4)  # 2.5 rad/s * 0.08 / 0.5
 
 
 @pytest.mark.parametrize(
@@ -151,18 +151,18 @@ def test_each_part_of_the_velocity_has_its_own_source() -> None:
 def test_the_percentage_of_the_battery_follows_from_its_voltage(
     volts: float, percent: float
 ) -> None:
-    it = report()
-    assert it.battery(0) is None
-    it.update({"battery_voltage": volts}, 20 * MS)
-    battery = it.battery(20 * MS)
+    report = make_report()
+    assert report.battery(0) is None
+    report.update({"battery_voltage": volts}, 20 * MS)
+    battery = report.battery(20 * MS)
     assert battery is not None
     assert (battery.voltage, battery.percentage) == pytest.approx((volts, percent))
 
 
 def test_wheels_have_their_temperatures() -> None:
-    it = report()
-    it.update({"wheel_left_temperature": 31.5, "wheel_right_temperature": 30.0}, 20 * MS)
-    assert [(j.name, j.temperature) for j in it.joints(20 * MS)] == [
+    report = make_report()
+    report.update({"wheel_left_temperature": 31.5, "wheel_right_temperature": 30.0}, 20 * MS)
+    assert [(j.name, j.temperature) for j in report.joints(20 * MS)] == [
         ("wheel_left_joint", 31.5),
         ("wheel_right_joint", 30.0),
     ]
@@ -174,14 +174,14 @@ def test_the_odometry_of_a_car_uses_its_steering_angle() -> None:
     )
     base = wheels_of(robot)
     assert isinstance(base, Ackermann)
-    it = LineReport(OPTIONS, robot, base)
+    report = LineReport(OPTIONS, robot, base)
     drive, steering = base.to_wheels(Twist(1.0, 0.0, 0.5))
     for n in range(51):
         line = {"wheel_drive_position": drive * 0.02 * n, "wheel_steering_position": steering}
-        it.update(line, 20 * (n + 1) * MS)
-    assert it.pose.yaw == pytest.approx(0.5)
-    assert it.pose.x == pytest.approx(2.0 * math.sin(0.5), abs=1e-4)
-    assert it.joints(0)[1].position == pytest.approx(steering)
+        report.update(line, 20 * (n + 1) * MS)
+    assert report.pose.yaw == pytest.approx(0.5)
+    assert report.pose.x == pytest.approx(2.0 * math.sin(0.5), abs=1e-4)
+    assert report.joints(0)[1].position == pytest.approx(steering)
 
 
 async def test_a_battery_and_temperatures_expire_without_new_values() -> None:
@@ -290,8 +290,8 @@ async def test_a_body_is_lost_without_flags_that_it_repeated(
 
 
 def test_an_expired_percentage_is_not_an_empty_battery() -> None:
-    it = report(TWO_LINES)
+    report = make_report(TWO_LINES)
     for n in range(50):
-        it.update({"battery_percentage": 80.0}, 20 * n * MS)
-    it.update({"battery_voltage": 12.0}, 4000 * MS)
-    assert it.battery(4000 * MS) is None
+        report.update({"battery_percentage": 80.0}, 20 * n * MS)
+    report.update({"battery_voltage": 12.0}, 4000 * MS)
+    assert report.battery(4000 * MS) is None

@@ -81,9 +81,9 @@ class LineOptions(LinkOptions, frozen=True, kw_only=True, forbid_unknown_fields=
 
     def state_templates(self) -> tuple[Template, ...]:
         """Return the templates of the state lines."""
-        turn = self.ticks_per_turn
+        per_turn = self.ticks_per_turn
         return tuple(
-            _template(f"state[{i}]", text, STATE, turn) for i, text in enumerate(self.state)
+            _template(f"state[{i}]", text, STATE, per_turn) for i, text in enumerate(self.state)
         )
 
     def strings(self) -> dict[bytes, str]:
@@ -134,9 +134,9 @@ class LineOptions(LinkOptions, frozen=True, kw_only=True, forbid_unknown_fields=
                 )
 
 
-def _template(field: str, text: str, known: dict[str, str], turn: float | None) -> Template:
+def _template(field: str, text: str, known: dict[str, str], per_turn: float | None) -> Template:
     try:
-        return Template(text, known, turn)
+        return Template(text, known, per_turn)
     except ValueError as error:
         raise ValueError(f"{field}: {error}") from None
 

@@ -174,7 +174,7 @@ class Field:
 
 
 def parse_field(
-    name: str, unit: str | None, form: str | None, known: Mapping[str, str], turn: float | None
+    name: str, unit: str | None, form: str | None, known: Mapping[str, str], per_turn: float | None
 ) -> Field:
     """Return the field between two braces. Raises ValueError with the field's name."""
     if name in CHECKS:
@@ -183,7 +183,7 @@ def parse_field(
         raise ValueError(str(unknown("field", name, [*known, *CHECKS])))
     quantity, unit = known[name], (unit or "").strip()
     try:
-        scale = factor(quantity, unit, turn)
+        scale = factor(quantity, unit, per_turn)
     except ValueError as error:
         raise ValueError(f"{{{name}}}: {error}") from None
     if form is None:
