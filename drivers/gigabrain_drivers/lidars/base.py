@@ -145,8 +145,8 @@ class TurnBuffer(abc.ABC, Generic[Piece]):
     def finish(self, now_ns: int) -> LaserScan | None:
         """Return the scan of the turn that ends now, and begin a new turn.
 
-        Return None if the start of the turn was not seen, or its bytes arrived faster or slower
-        than a lidar turns. After a delay of the process, old bytes arrive from the port at once.
+        Return None if the start of the turn was not seen, or it was much too short or too long.
+        After a delay of the process, old bytes arrive from the port at once.
         """
         pieces, count, start_seen = self._pieces, self._count, self._start_seen
         periods = (now_ns - self._began_ns) / self._period_ns

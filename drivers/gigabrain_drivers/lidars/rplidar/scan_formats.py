@@ -3,8 +3,8 @@
 Little-endian; angles run clockwise, in 1/64 degree (q6). Encoders are for emulators. Sources:
 Slamtec's interface protocol document and the public rplidar_sdk.
 
-With 0.1 % of all bytes wrong, 0.25 % of a million standard nodes, which have no checksum, were
-decoded wrong. Of 200000 capsules, 15 % were lost, and 3 or 4 were decoded wrong.
+With 0.1 % of all bytes wrong, 0.25 % of a million standard nodes were decoded wrong: they have no
+checksum. Of 200000 capsules, 15 % were lost, and 3 or 4 were decoded wrong.
 """
 
 import abc
