@@ -1,14 +1,16 @@
 """Feeds recorded input to a node in fake time, and compares its output with the recording.
 
 These are not compared: the time of sending (`stamp_ns`), the message number (`seq`), sentences for
-people (but their codes and values are), and safety's warnings about its computer. Of several
-messages on one key for one tick and basis only the last is compared, as their number depends on
-the order of two inputs within a tick.
+people (but their codes and values are), and safety's warnings about its computer. Numbers may
+differ by FLOAT_TOLERANCE. Of several messages on one key for one tick and basis only the last is
+compared, as their number depends on the order of two inputs within a tick.
 """
 
+import math
 import re
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -55,6 +57,10 @@ OUTPUTS: dict[str, tuple[Topic[Any], ...]] = {
 }
 NOT_COMPARED = ("stamp_ns", "seq")
 SENTENCE = re.compile(r"(.*\.)?(text|remedy|reason)")  # fields with sentences for people
+# relative, and absolute in the field's unit: kernels are compiled for the processor that runs them,
+# and processors differ in the last digits
+FLOAT_TOLERANCE = 1e-6
+MAX_SHOWN_FIELDS = 10  # of an output that differs
 PROCESSES_WITH_SETTINGS = ("perception", "decision")
 # A process that is busy for a tick skips a state, but a replay does not.
 MAX_UNMATCHED_SHARE = 0.1  # of outputs that only the recording or only the replay contains
@@ -67,16 +73,12 @@ _granted = Codec(REQUEST_LOG.type, REQUEST_LOG.max_bytes)
 
 
 class Difference(Struct, frozen=True, kw_only=True):
-    """First output that differs from the recording."""
+    """The first output that differs from the recording."""
 
     key: str
     tick: int
     basis: int
-    field: str  # dotted
-    recorded: object
-    replayed: object
-    recorded_message: Message
-    replayed_message: Message
+    fields: Mapping[str, tuple[object, object]]  # dotted name: recorded and replayed value
 
 
 class ReplayResult(Struct, frozen=True, kw_only=True):
@@ -283,21 +285,23 @@ def compare(
 
 def _difference(key: str, recorded: Message, replayed: Message) -> Difference | None:
     before, after = row(recorded), row(replayed)
-    for field in dict.fromkeys((*before, *after)):
-        if field in NOT_COMPARED or SENTENCE.fullmatch(field):
-            continue
-        if before.get(field) != after.get(field):
-            return Difference(
-                key=key,
-                tick=recorded.tick,
-                basis=recorded.basis,
-                field=field,
-                recorded=before.get(field),
-                replayed=after.get(field),
-                recorded_message=recorded,
-                replayed_message=replayed,
-            )
-    return None
+    fields = {
+        field: (before.get(field), after.get(field))
+        for field in dict.fromkeys((*before, *after))
+        if not (field in NOT_COMPARED or SENTENCE.fullmatch(field))
+        and not _same(before.get(field), after.get(field))
+    }
+    if not fields:
+        return None
+    return Difference(key=key, tick=recorded.tick, basis=recorded.basis, fields=fields)
+
+
+def _same(recorded: object, replayed: object) -> bool:
+    """Return whether two values are equal, numbers within FLOAT_TOLERANCE."""
+    if isinstance(recorded, float) and isinstance(replayed, float):
+        tolerance = FLOAT_TOLERANCE
+        return math.isclose(recorded, replayed, rel_tol=tolerance, abs_tol=tolerance)
+    return recorded == replayed
 
 
 async def replay_process(
@@ -375,10 +379,11 @@ def report_lines(path: Path, process: str, result: ReplayResult) -> Iterator[str
         counts += f"{result.only_replayed} only in the replay"
     if found := result.difference:
         yield f"{path}: {process} behaves differently; first difference:"
-        yield f"{found.key} at tick {found.tick}, based on tick {found.basis}: {found.field}"
-        yield f"  recorded {found.recorded!r}, now {found.replayed!r}"
-        yield f"  recorded {msgspec.json.encode(found.recorded_message).decode()}"
-        yield f"  now      {msgspec.json.encode(found.replayed_message).decode()}"
+        yield f"{found.key} at tick {found.tick}, based on tick {found.basis}:"
+        for field, (recorded, replayed) in islice(found.fields.items(), MAX_SHOWN_FIELDS):
+            yield f"  {field}: recorded {recorded!r}, now {replayed!r}"
+        if len(found.fields) > MAX_SHOWN_FIELDS:
+            yield f"  and {len(found.fields) - MAX_SHOWN_FIELDS} other fields"
     elif not result.same:
         yield f"{path}: {process} sends at different times: {counts}"
     else:

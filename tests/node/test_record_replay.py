@@ -44,9 +44,13 @@ from gigabrain_zenoh.recording.bag_writer import ReceivedMessage
 from gigabrain_zenoh.recording.message_tables import message_of
 from gigabrain_zenoh.recording.process_replay import (
     OUTPUTS,
+    Difference,
+    OutputId,
+    ReplayResult,
     compare,
     load_run,
     replay_process,
+    report_lines,
     settings_for,
     with_requests,
 )
@@ -61,7 +65,8 @@ RECORDINGS = Path(__file__).parents[1] / "recordings"
 RENEW = "was the change meant? then: make recordings"
 
 
-LONG = {("exploring", "perception"), ("exploring", "decision")}
+# matching scans amplifies the last digits, in which processors differ, to 0.7 mm and 0.15 degrees
+LONG = {("exploring", "perception")}
 REPLAYS = [
     pytest.param(name, process, marks=pytest.mark.qa if (name, process) in LONG else ())
     for name in DRIVES
@@ -139,10 +144,7 @@ def test_of_a_process_that_was_changed_the_first_difference_is_shown(
     told = capsys.readouterr().out.splitlines()
     assert told[0] == f"{path}: decision behaves differently; first difference:"
     assert told[1].startswith("robot/intent at tick ")
-    assert told[1].endswith(": twist.linear_x")
-    assert told[2] == "  recorded 0.2, now 0.1"
-    assert '"linear_x":0.2' in told[3]
-    assert '"linear_x":0.1' in told[4]
+    assert told[2] == "  twist.linear_x: recorded 0.2, now 0.1"
 
 
 def test_a_recording_without_the_process_is_refused(tmp_path: Path) -> None:
@@ -325,4 +327,23 @@ def test_a_reworded_cause_is_no_difference_and_another_code_is() -> None:
     reworded = {("robot/safety", 0, 0, 0): verdict("blind", "no scan has arrived")}
     assert compare(recorded, reworded).same
     other = {("robot/safety", 0, 0, 0): verdict("stale", "the lidar is silent")}
-    assert compare(recorded, other).difference.field == "causes.0.code"
+    assert compare(recorded, other).difference.fields == {"causes.0.code": ("blind", "stale")}
+
+
+def test_a_number_that_differs_by_rounding_only_is_no_difference() -> None:
+    def sent(speed: float) -> dict[OutputId, Message]:
+        return {("robot/cmd_vel", 0, 0, 0): CmdVel(linear_x=speed)}
+
+    assert compare(sent(2.0), sent(2.000_001)).same
+    assert compare(sent(0.0), sent(0.000_000_9)).same
+    assert not compare(sent(2.0), sent(2.000_003)).same
+    assert not compare(sent(0.0), sent(0.000_001_1)).same
+
+
+def test_of_an_output_with_many_differences_ten_fields_are_shown() -> None:
+    fields = {f"ranges.{i}": (0.0, 1.0) for i in range(12)}
+    found = Difference(key="robot/scan", tick=3, basis=2, fields=fields)
+    result = ReplayResult(compared=1, only_recorded=0, only_replayed=0, difference=found)
+    _, head, *lines = report_lines(Path("a.mcap"), "perception", result)
+    assert head == "robot/scan at tick 3, based on tick 2:"
+    assert lines[9:] == ["  ranges.9: recorded 0.0, now 1.0", "  and 2 other fields"]
