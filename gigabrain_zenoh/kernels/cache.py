@@ -11,10 +11,10 @@ from pathlib import Path
 from platformdirs import user_cache_path
 
 PACKAGE = Path(__file__).parents[1]
-HOLDERS = ("kernels", "manipulation", "mapping", "navigation", "qa/bench")  # packages with kernels
+KERNEL_PACKAGES = ("kernels", "manipulation", "mapping", "navigation", "qa/bench")
 FOLDER = "NUMBA_CACHE_DIR"  # environment variable
 CPU_INFO = Path("/proc/cpuinfo")
-FEATURES = ("flags", "Features")  # begin of the line with a processor's features: x86, ARM
+FEATURES_LABELS = ("flags", "Features")  # of the line with a processor's features: x86, ARM
 
 
 def kernel_folder() -> Path | None:
@@ -27,7 +27,7 @@ def cache_folder() -> Path | None:
     """Return the cache folder for exactly these sources; None for a user without a home directory.
 
     Numba detects changes only in a kernel's own file, not in those of the kernels that it calls.
-    It also compiles again for a file with another path, as in a second checkout, or another time.
+    It also compiles again if a file's path differs, as in a second checkout, or its time.
     """
     try:
         return user_cache_path("gigabrain") / f"kernels-{digest(PACKAGE)}"
@@ -59,8 +59,8 @@ def suffix() -> str:
 def digest(package: Path) -> str:
     """Return a digest of the packages with kernels, computed at the first call."""
     sources = hashlib.sha256()
-    for holder in HOLDERS:
-        for source in sorted((package / holder).rglob("*.py")):
+    for name in KERNEL_PACKAGES:
+        for source in sorted((package / name).rglob("*.py")):
             sources.update(source.read_bytes())
             sources.update(f"{source} {source.stat().st_mtime_ns}".encode(errors="replace"))
     return sources.hexdigest()[:16]
@@ -72,7 +72,7 @@ def _machine() -> str:
     parts = [sys.version, version("numba"), version("numpy"), platform.machine()]
     try:
         lines = CPU_INFO.read_text().splitlines()
-        parts += [next(line for line in lines if line.startswith(FEATURES))]
+        parts += [next(line for line in lines if line.startswith(FEATURES_LABELS))]
     except (OSError, StopIteration):
         parts += [platform.processor()]
     return hashlib.sha256("\n".join(parts).encode()).hexdigest()[:16]

@@ -1,7 +1,7 @@
 """Operations on grids of cells: distances, dilation and connected parts.
 
-The capped distance transform is exact: cv2.distanceTransform gave equal cells, in 0.28 ms where
-this took 0.08 ms (200 x 200 cells, cap 16). OpenCV is not used, as it takes 160 MB.
+The capped distance transform is exact, like that of OpenCV. For 200 x 200 cells and a cap of 16, it
+takes 0.08 ms, OpenCV 0.28 ms. OpenCV would also take 160 MB of memory.
 """
 
 import numpy as np
@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from gigabrain_zenoh.kernels.jit import kernel
 
-OCCUPIED_PERCENT = 50  # from this on, a cell counts as occupied
+OCCUPIED_PERCENT = 50  # least value of an occupied cell
 Cells = NDArray[np.int8]
 Singles = NDArray[np.float32]
 Bytes = NDArray[np.uint8]
@@ -34,55 +34,56 @@ def _along_columns(cells: Cells, cap: np.float32, out: Singles) -> None:
     above = np.full(cells.shape[1], cap, np.float32)
     for row in range(cells.shape[0]):
         for column in range(cells.shape[1]):
-            away = above[column] + one
-            away = cap if away > cap else away
-            away = zero if cells[row, column] >= OCCUPIED_PERCENT else away
-            above[column] = away
-            out[row, column] = away
+            distance = above[column] + one
+            distance = cap if distance > cap else distance
+            distance = zero if cells[row, column] >= OCCUPIED_PERCENT else distance
+            above[column] = distance
+            out[row, column] = distance
     above[:] = cap
     for row in range(cells.shape[0] - 1, -1, -1):
         for column in range(cells.shape[1]):
-            away, known = above[column] + one, out[row, column]
-            away = known if known < away else away
-            above[column] = away
-            out[row, column] = away
+            distance, from_above = above[column] + one, out[row, column]
+            distance = from_above if from_above < distance else distance
+            above[column] = distance
+            out[row, column] = distance
 
 
 @kernel
 def _along_rows(out: Singles, cap: int) -> None:
-    """Square distances, and combine those up to `cap` cells to both sides.
+    """Turn distances within columns into squared distances in the plane.
 
-    It uses slices, as those are vectorised; indices are not.
+    Each is combined with those up to `cap` cells left and right of it. Loops over slices are
+    vectorised; loops over indices are not.
     """
     width = out.shape[1]
     largest = np.float32(cap * cap)
     padded = np.full(width + 2 * cap, largest, np.float32)
     for row in range(out.shape[0]):
-        here = out[row]
-        near = False
+        line = out[row]
+        has_obstacle = False
         for column in range(width):
-            square = here[column] * here[column]
-            near |= square < largest
-            here[column] = square
-        if not near:
+            square = line[column] * line[column]
+            has_obstacle |= square < largest
+            line[column] = square
+        if not has_obstacle:
             continue
-        middle = padded[cap : cap + width]
+        centre = padded[cap : cap + width]
         for column in range(width):  # numba needs seconds to compile the assignment of a slice
-            middle[column] = here[column]
-        for aside in range(1, cap):
-            left = padded[cap - aside : cap - aside + width]
-            right = padded[cap + aside : cap + aside + width]
-            more = np.float32(aside * aside)
+            centre[column] = line[column]
+        for offset in range(1, cap):
+            left = padded[cap - offset : cap - offset + width]
+            right = padded[cap + offset : cap + offset + width]
+            offset_squared = np.float32(offset * offset)
             for column in range(width):
-                a, b, best = left[column], right[column], here[column]
-                found = (a if a < b else b) + more
-                here[column] = found if found < best else best
+                a, b, best = left[column], right[column], line[column]
+                candidate = (a if a < b else b) + offset_squared
+                line[column] = candidate if candidate < best else best
 
 
 def dilated(image: Bytes, before: int, after: int) -> Bytes:
     """Return the largest value (h, w) from `before` cells before to `after` cells after each cell.
 
-    This holds for rows and columns. Outside the image are zeros.
+    The window covers rows and columns. Cells outside the image count as 0.
     """
     for axis in (0, 1):
         pads = [(0, 0), (0, 0)]
@@ -95,34 +96,34 @@ def dilated(image: Bytes, before: int, after: int) -> Bytes:
 
 @kernel
 def connected_parts(mask: NDArray[np.bool_]) -> tuple[Ints, Ints]:
-    """Return the set cells (n,) of `mask` as flat indices, part by part, and the parts' begins.
+    """Return the set cells (n,) of `mask` as flat indices, part by part, and each part's start.
 
-    Cells that touch, also at a corner, belong to one part. The second array (k + 1,) has the begin
+    Cells that touch, also at a corner, belong to one part. The second array (k + 1,) has the start
     of each part, and n at its end. Parts are in the order of their first cells.
     """
     height, width = mask.shape
-    left = mask.copy()
-    count = left.sum()
+    unvisited = mask.copy()
+    count = unvisited.sum()
     cells = np.empty(count, np.int64)
-    begins = np.empty(count + 1, np.int64)
+    starts = np.empty(count + 1, np.int64)
     parts = end = 0
     for first_row in range(height):
         for first_column in range(width):
-            if not left[first_row, first_column]:
+            if not unvisited[first_row, first_column]:
                 continue
-            begins[parts] = here = end
+            starts[parts] = current = end
             parts += 1
-            left[first_row, first_column] = False
+            unvisited[first_row, first_column] = False
             cells[end] = first_row * width + first_column
             end += 1
-            while here < end:
-                y, x = cells[here] // width, cells[here] % width
+            while current < end:
+                y, x = cells[current] // width, cells[current] % width
                 for row in range(max(y - 1, 0), min(y + 2, height)):
                     for column in range(max(x - 1, 0), min(x + 2, width)):
-                        if left[row, column]:
-                            left[row, column] = False
+                        if unvisited[row, column]:
+                            unvisited[row, column] = False
                             cells[end] = row * width + column
                             end += 1
-                here += 1
-    begins[parts] = end
-    return cells, begins[: parts + 1]
+                current += 1
+    starts[parts] = end
+    return cells, starts[: parts + 1]

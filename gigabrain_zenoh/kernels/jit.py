@@ -18,8 +18,8 @@ import numpy as np
 from gigabrain_zenoh.kernels import cache, linked
 
 UNUSED = ("scipy.linalg", "coverage", "cffi")
-# these submodules look for BLAS and cffi; otherwise that happens at the first call
-PARTS = ("numba", "numba.np.arraymath", "numba.core.typing.cffi_utils")
+# without its submodules here, numba would look for BLAS and cffi at the first call
+NUMBA_MODULES = ("numba", "numba.np.arraymath", "numba.core.typing.cffi_utils")
 
 F = TypeVar("F", bound=Callable[..., object])
 NONE = np.int64(0)  # a literal would be compiled separately
@@ -30,16 +30,16 @@ def import_numba() -> Any:
     """Import numba, with `cache.kernel_folder` as its cache."""
     if folder := cache.cache_folder():
         os.environ.setdefault(cache.FOLDER, str(folder))
-    with _as_if_missing(*UNUSED):
-        for part in PARTS:
-            importlib.import_module(part)
+    with _unimportable(*UNUSED):
+        for module in NUMBA_MODULES:
+            importlib.import_module(module)
     numba: Any = sys.modules["numba"]
     numba.core.config.reload_config()
     return numba
 
 
 @contextmanager
-def _as_if_missing(*names: str) -> Iterator[None]:
+def _unimportable(*names: str) -> Iterator[None]:
     """Make modules that are not yet imported unimportable inside the block."""
     modules: dict[str, Any] = sys.modules
     hidden = [name for name in names if name not in modules]
@@ -54,16 +54,16 @@ def _as_if_missing(*names: str) -> Iterator[None]:
 unsaved: list[OSError] = []  # errors when this process saved compiled kernels
 
 
-def _if_possible(save: Callable[..., None]) -> Callable[..., None]:
-    """Return `save` without its OSErrors, which numba would raise from a kernel."""
+def _noting_errors(save: Callable[..., None]) -> Callable[..., None]:
+    """Return `save` with its OSErrors put into `unsaved`; numba would raise them from a kernel."""
 
-    def saved(*arguments: object) -> None:
+    def save_or_note(*arguments: object) -> None:
         try:
             save(*arguments)
         except OSError as error:
             unsaved.append(error)
 
-    return saved
+    return save_or_note
 
 
 class Kernel:
@@ -73,12 +73,12 @@ class Kernel:
         functools.update_wrapper(self, function)
         self.function, self._lean = function, lean
         self.name = f"{function.__module__}:{function.__qualname__}"
-        self.called = False  # from Python, with numba
+        self.called = False  # True once numba has run it for a caller in Python
 
     def __call__(self, *arguments: Any) -> Any:
         """Call the kernel; it runs without the GIL."""
-        for takes, function in self._linked:
-            if takes(arguments):
+        for matches, function in self._linked:
+            if matches(arguments):
                 return function(*arguments)
         self.called = True
         return self.dispatcher(*arguments)
@@ -86,11 +86,11 @@ class Kernel:
     @property
     def overloads(self) -> int:
         """Number of signatures for which it is compiled, in a library or in this process."""
-        here = len(self.dispatcher.signatures) if "dispatcher" in vars(self) else 0
-        return len(self._linked) + here
+        by_numba = len(self.dispatcher.signatures) if "dispatcher" in vars(self) else 0
+        return len(self._linked) + by_numba
 
     @functools.cached_property
-    def _linked(self) -> tuple[tuple[linked.Takes, Callable[..., Any]], ...]:
+    def _linked(self) -> linked.Overloads:
         return linked.overloads_of(self.name)
 
     @functools.cached_property
@@ -106,7 +106,7 @@ class Kernel:
             dispatcher = numba.njit(cache=True, **options)(self.function)
         except RuntimeError:  # numba: no locator available
             return numba.njit(**options)(self.function)
-        dispatcher._cache.save_overload = _if_possible(dispatcher._cache.save_overload)
+        dispatcher._cache.save_overload = _noting_errors(dispatcher._cache.save_overload)
         return dispatcher
 
     @property
@@ -116,7 +116,7 @@ class Kernel:
 
 
 def kernel(function: F) -> F:
-    """Return `function` as a kernel, which is compiled."""
+    """Return `function` as a compiled kernel."""
     return cast("F", Kernel(function, lean=False))
 
 

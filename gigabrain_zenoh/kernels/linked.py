@@ -30,8 +30,8 @@ SCALARS: dict[str, tuple[type, ...]] = {
     "uint8": (np.uint8,),
     "float32": (np.float32,),
 }
-Takes = Callable[[Any], bool]
-Overloads = tuple[tuple[Takes, Callable[..., Any]], ...]  # check of arguments, and function
+Matcher = Callable[[Any], bool]
+Overloads = tuple[tuple[Matcher, Callable[..., Any]], ...]  # check of arguments, and function
 
 
 class ScalarType(Struct, frozen=True, tag="scalar"):
@@ -59,33 +59,33 @@ class Overload(Struct, frozen=True):
 
     kernel: str  # "module:name"
     symbol: str  # name in the library
-    takes: TupleType
+    arguments: TupleType
 
 
-def matcher(of: ScalarType | ArrayType | TupleType) -> Takes:
+def matcher(kind: ScalarType | ArrayType | TupleType) -> Matcher:
     """Return a function that checks whether a value has exactly this type."""
-    if isinstance(of, ScalarType):
-        types = SCALARS[of.name]
+    if isinstance(kind, ScalarType):
+        types = SCALARS[kind.name]
         return lambda value: type(value) in types
-    if isinstance(of, ArrayType):
-        return _array_matcher(np.dtype(of.dtype), of.ndim, of.contiguous)
-    matchers = tuple(matcher(item) for item in of.items)
+    if isinstance(kind, ArrayType):
+        return _array_matcher(np.dtype(kind.dtype), kind.ndim, kind.contiguous)
+    matchers = tuple(matcher(item) for item in kind.items)
 
-    def is_such_a_tuple(value: Any) -> bool:
+    def matches_tuple(value: Any) -> bool:
         if not isinstance(value, tuple) or len(value) != len(matchers):
             return False
         return all(map(operator.call, matchers, value))  # a generator takes twice as long
 
-    return is_such_a_tuple
+    return matches_tuple
 
 
-def _array_matcher(dtype: np.dtype[Any], ndim: int, contiguous: bool) -> Takes:
-    def is_such_an_array(value: Any) -> bool:
+def _array_matcher(dtype: np.dtype[Any], ndim: int, contiguous: bool) -> Matcher:
+    def matches_array(value: Any) -> bool:
         if type(value) is not np.ndarray or value.dtype != dtype or value.ndim != ndim:
             return False
         return value.flags.carray if contiguous else value.flags.behaved
 
-    return is_such_an_array
+    return matches_array
 
 
 def overloads_of(kernel: str) -> Overloads:
@@ -104,9 +104,9 @@ def load_all() -> dict[str, Overloads]:
         except (ImportError, OSError, msgspec.MsgspecError) as error:
             log.warning("linked kernels are left to numba: %s; remove %s", error, index)
             continue
-        for one in overloads:
-            entry = matcher(one.takes), getattr(library, one.symbol)
-            found[one.kernel] = (*found.get(one.kernel, ()), entry)
+        for overload in overloads:
+            entry = matcher(overload.arguments), getattr(library, overload.symbol)
+            found[overload.kernel] = (*found.get(overload.kernel, ()), entry)
     return found
 
 

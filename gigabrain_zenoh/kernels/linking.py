@@ -75,28 +75,29 @@ def _library() -> Any:
 
 def _export(library: Any) -> Iterator[Overload]:
     """Add the called kernels to a library, for each signature, and yield their overloads."""
-    called = [one for one in gc.get_objects() if isinstance(one, Kernel) and one.called]
-    for kernel in sorted(called, key=lambda one: one.name):
-        signatures = [one.signature for one in kernel.dispatcher.overloads.values()]
-        for signature in sorted(signatures, key=lambda one: "A)" in str(one)):
-            takes = type_of(numba.types.Tuple(signature.args))
-            if isinstance(takes, TupleType):
+    called = [item for item in gc.get_objects() if isinstance(item, Kernel) and item.called]
+    for kernel in sorted(called, key=lambda item: item.name):
+        signatures = [overload.signature for overload in kernel.dispatcher.overloads.values()]
+        # "A)" stands for an array of any layout; contiguous ones match first
+        for signature in sorted(signatures, key=lambda item: "A)" in str(item)):
+            arguments = type_of(numba.types.Tuple(signature.args))
+            if isinstance(arguments, TupleType):
                 symbol = f"kernel_{len(library._exported_functions)}"
                 library.export(symbol, signature)(kernel.function)
-                yield Overload(kernel.name, symbol, takes)
+                yield Overload(kernel.name, symbol, arguments)
 
 
-def type_of(known: Any) -> ScalarType | ArrayType | TupleType | None:
-    """Convert one of numba's types; None if a library cannot take it, so that numba runs it."""
+def type_of(numba_type: Any) -> ScalarType | ArrayType | TupleType | None:
+    """Convert one of numba's types; return None if only numba can handle it."""
     types = numba.types
-    if isinstance(known, types.Array):
-        if known.layout == "F" or not (known.mutable and known.aligned):
+    if isinstance(numba_type, types.Array):
+        if numba_type.layout == "F" or not (numba_type.mutable and numba_type.aligned):
             return None
-        return ArrayType(str(known.dtype), known.ndim, known.layout == "C")
-    if isinstance(known, types.BaseTuple):
-        items = tuple(type_of(item) for item in known)
+        return ArrayType(str(numba_type.dtype), numba_type.ndim, numba_type.layout == "C")
+    if isinstance(numba_type, types.BaseTuple):
+        items = tuple(type_of(item) for item in numba_type)
         return None if None in items else TupleType(tuple(item for item in items if item))
-    return ScalarType(str(known)) if str(known) in SCALARS else None
+    return ScalarType(str(numba_type)) if str(numba_type) in SCALARS else None
 
 
 if __name__ == "__main__":

@@ -24,18 +24,18 @@ from gigabrain_zenoh.kernels import cache, jit
 from gigabrain_zenoh.plugins import find
 
 log = logging.getLogger(__name__)
-QUIET_S = 5.0  # longer compiling is logged
-COLLECT_AFTER = 100_000  # new objects; with the default of 700, compiling takes a tenth longer
-TRIES = 2  # of compiling, if the child is killed
-COMPILERS = "CC", "CXX"  # variables of the compilers that linking needs
-LINKING = "gigabrain_zenoh.kernels.linking"  # a module that imports a compiler
-LAST_NICE = 19  # runs only when no process of the robot does
+LOG_AFTER_S = 5.0  # longer compiling is logged
+GC_THRESHOLD = 100_000  # objects; with the default of 700, compiling takes a tenth longer
+MAX_TRIES = 2  # if the child process that compiles is killed
+COMPILER_VARIABLES = "CC", "CXX"  # environment variables of the compilers for linking
+LINKING_MODULE = "gigabrain_zenoh.kernels.linking"  # imports a compiler, so not imported here
+LOWEST_NICE = 19  # runs only while no process of the robot needs the processor
 
 
 class Kernels:
-    """The kernels that the function at "module:name" calls, for a process that can work without.
+    """The kernels that the function at "module:name" calls, for a process that works without them.
 
-    `in_time` decides from which scan on they are used, so that a replay does the same.
+    `in_time` decides which scan is the first to use them, so that a replay does the same.
     """
 
     def __init__(self, warm_up: str, in_time: InTime) -> None:
@@ -61,9 +61,9 @@ class Kernels:
             self._job.set_result(None)
 
     def begin(self) -> None:
-        """Begin to load them in the background, and to compile missing ones; only once."""
+        """Start to load them in the background, and compile missing ones first. Works only once."""
         if not self._loading and not self._job.done():
-            self._loading = asyncio.ensure_future(self._load_beside())
+            self._loading = asyncio.ensure_future(self._load_in_background())
 
     async def finish(self) -> None:
         """Wait until they are loaded. Raises ConfigError like `load`."""
@@ -84,21 +84,21 @@ class Kernels:
         self._loaded = self._loaded or self._in_time(self._job, 0.0)
         return self._loaded
 
-    async def _load_beside(self) -> None:
+    async def _load_in_background(self) -> None:
         try:
             if await asyncio.to_thread(_is_missing, self._warm_up):
-                await self._compile_aside()
+                await self._compile_in_background()
             await asyncio.to_thread(_call, self._warm_up)
         except ModuleNotFoundError as error:
             raise missing_package(error) from None
         self._job.set_result(None)
 
-    async def _compile_aside(self) -> None:
-        """Compile in a child, and again if it is killed: compiling here delays this process."""
+    async def _compile_in_background(self) -> None:
+        """Compile in a child process, as compiling delays its process. Retry if it is killed."""
         join_in()
         data = {"event": "compiling"}
         log.info("compiling, once per installation; works meanwhile", extra={"data": data})
-        for _ in range(TRIES):
+        for _ in range(MAX_TRIES):
             code = await compile_in_child(self._warm_up, step_aside=True)
             if code == 0:
                 log.info("compiled", extra={"data": {"event": "compiled"}})
@@ -132,7 +132,7 @@ def _is_missing(warm_up: str) -> bool:
 
 
 def is_kept(warm_up: str) -> bool:
-    """Return whether the kernels that it calls are compiled and on disk."""
+    """Return whether the kernels that `warm_up` calls are compiled and on disk."""
     mark = cache.mark_of(warm_up)
     return mark is not None and mark.exists()
 
@@ -144,7 +144,7 @@ def _call(warm_up: str) -> None:
 async def _log_if_slow(work: Awaitable[object]) -> None:
     compiling = asyncio.ensure_future(work)
     try:
-        done, _ = await asyncio.wait((compiling,), timeout=QUIET_S)
+        done, _ = await asyncio.wait((compiling,), timeout=LOG_AFTER_S)
         if not done:
             join_in()  # compile at normal priority: it takes a minute
             data = {"event": "compiling"}
@@ -163,10 +163,10 @@ async def compile_in_child(warm_up: str, *, step_aside: bool = False) -> int:
 async def link_in_child(library: str, *warm_ups: str) -> int:
     """Link the compiled kernels of `warm_ups` in a child process, and return its exit code."""
     about = f"linking {library}"
-    return await _in_child(about, LINKING, library, str(os.getpid()), *warm_ups)
+    return await _in_child(about, LINKING_MODULE, library, str(os.getpid()), *warm_ups)
 
 
-async def _in_child(doing: str, module: str, *arguments: str) -> int:
+async def _in_child(activity: str, module: str, *arguments: str) -> int:
     paths = os.pathsep.join(path for path in sys.path if path)
     child = await asyncio.create_subprocess_exec(
         *(sys.executable, "-P", "-m", module),  # -P: do not import from the current folder
@@ -179,7 +179,7 @@ async def _in_child(doing: str, module: str, *arguments: str) -> int:
     try:
         _, errors = await child.communicate()
         if child.returncode and (text := errors.decode(errors="replace").strip()):
-            log.warning("%s beforehand failed: %s", doing, text.splitlines()[-1])
+            log.warning("%s beforehand failed: %s", activity, text.splitlines()[-1])
             log.debug("%s", text)
         return child.returncode or 0
     finally:
@@ -190,10 +190,14 @@ async def _in_child(doing: str, module: str, *arguments: str) -> int:
 
 def can_link() -> bool:
     """Return whether linking is possible: with compilers, Python.h and setuptools."""
-    compilers = (os.environ.get(one) or sysconfig.get_config_var(one) for one in COMPILERS)
+    compilers = (
+        os.environ.get(name) or sysconfig.get_config_var(name) for name in COMPILER_VARIABLES
+    )
     headers = Path(sysconfig.get_path("include"), "Python.h")
-    has_files = headers.exists() and find_spec("setuptools")
-    return bool(has_files) and all(one and shutil.which(one.split()[0]) for one in compilers)
+    has_sources = headers.exists() and find_spec("setuptools")
+    return bool(has_sources) and all(
+        command and shutil.which(command.split()[0]) for command in compilers
+    )
 
 
 def compile_all(warm_up: str) -> None:
@@ -207,7 +211,7 @@ def compile_all(warm_up: str) -> None:
 
 if __name__ == "__main__":
     this_process.die_with_parent(int(sys.argv[2]))
-    gc.set_threshold(COLLECT_AFTER)
+    gc.set_threshold(GC_THRESHOLD)
     if sys.argv[3:]:
-        os.nice(LAST_NICE)
+        os.nice(LOWEST_NICE)
     compile_all(sys.argv[1])

@@ -1,4 +1,4 @@
-"""Imported by a fork server: its forks share the linked kernels, or else numba's first set-up."""
+"""Loads linked kernels, or else numba's set-up, in a fork server, so that its forks share them."""
 
 from gigabrain_zenoh.kernels.jit import import_numba
 from gigabrain_zenoh.kernels.linked import load_all

@@ -11,28 +11,29 @@ RNG = default_rng(1)
 
 
 @pytest.mark.parametrize("share", [0.0, 0.05, 0.4, 0.7, 1.0])
-def test_parts_are_those_of_opencv_in_the_order_of_their_first_cells(share: float) -> None:
+def test_connected_parts_equal_those_of_opencv_ordered_by_first_cell(share: float) -> None:
     mask = RNG.random((60, 43)) < share
     count, labels = cv2.connectedComponents(mask.view(np.uint8))
-    wanted = sorted(np.flatnonzero(labels == label).tolist() for label in range(1, count))
-    cells, begins = connected_parts(mask)
-    assert begins[-1] == len(cells)
-    parts = [sorted(cells[begin:end].tolist()) for begin, end in pairwise(begins)]
-    assert parts == wanted
+    expected = sorted(np.flatnonzero(labels == label).tolist() for label in range(1, count))
+    cells, starts = connected_parts(mask)
+    assert starts[-1] == len(cells)
+    parts = [sorted(cells[start:end].tolist()) for start, end in pairwise(starts)]
+    assert parts == expected
 
 
 @pytest.mark.parametrize(("before", "after"), [(0, 7), (1, 1), (2, 0), (0, 0)])
-def test_dilation_is_that_of_opencv(before: int, after: int) -> None:
+def test_dilation_equals_that_of_opencv(before: int, after: int) -> None:
     image = RNG.integers(0, 256, (31, 50)).astype(np.uint8)
     side = before + after + 1
-    want = cv2.dilate(image, np.ones((side, side), np.uint8), anchor=(before, before))
-    np.testing.assert_array_equal(dilated(image, before, after), want)
+    expected = cv2.dilate(image, np.ones((side, side), np.uint8), anchor=(before, before))
+    np.testing.assert_array_equal(dilated(image, before, after), expected)
 
 
-def test_distances_are_those_of_opencv_up_to_the_cap() -> None:
+def test_distances_equal_those_of_opencv_up_to_the_cap() -> None:
     cells = np.where(RNG.random((80, 70)) < 0.01, np.int8(100), np.int8(0))
     exact = cv2.distanceTransform(
         np.where(cells, 0, 1).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE
     )
-    mine = np.sqrt(squared_distance(cells, 12))
-    np.testing.assert_allclose(mine, np.minimum(exact, 12), rtol=2e-7)  # its roots are estimates
+    distances = np.sqrt(squared_distance(cells, 12))
+    expected = np.minimum(exact, 12)
+    np.testing.assert_allclose(distances, expected, rtol=2e-7)  # OpenCV approximates roots

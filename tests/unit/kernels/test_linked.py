@@ -1,4 +1,4 @@
-"""Which values a linked kernel takes."""
+"""Types of the arguments that a linked kernel accepts."""
 
 from typing import Any, NamedTuple
 
@@ -22,7 +22,7 @@ READ_ONLY = np.frombuffer(bytes(96), np.float32).reshape(4, 6)
 
 
 @pytest.mark.parametrize(
-    ("of", "value"),
+    ("kind", "value"),
     [
         (NUMBER, 1.0),
         (NUMBER, np.float64(1.0)),
@@ -37,12 +37,12 @@ READ_ONLY = np.frombuffer(bytes(96), np.float32).reshape(4, 6)
         (TupleType((GRID, PAIR)), (CELLS, (1.0, 2.0))),
     ],
 )
-def test_a_value_of_the_type_is_taken(of: Any, value: object) -> None:
-    assert matcher(of)(value)
+def test_a_value_of_the_type_is_accepted(kind: Any, value: object) -> None:
+    assert matcher(kind)(value)
 
 
 @pytest.mark.parametrize(
-    ("of", "value"),
+    ("kind", "value"),
     [
         (NUMBER, 1),
         (NUMBER, np.float32(1.0)),
@@ -63,5 +63,5 @@ def test_a_value_of_the_type_is_taken(of: Any, value: object) -> None:
         (TupleType((GRID, PAIR)), (CELLS, (1.0, 2))),
     ],
 )
-def test_a_value_of_another_type_is_left_to_numba(of: Any, value: object) -> None:
-    assert not matcher(of)(value)
+def test_a_value_of_another_type_is_left_to_numba(kind: Any, value: object) -> None:
+    assert not matcher(kind)(value)
