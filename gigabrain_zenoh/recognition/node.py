@@ -34,28 +34,28 @@ if TYPE_CHECKING:
     from gigabrain_zenoh.recognition.observer import Observer
 
 log = logging.getLogger(__name__)
-EARLY_SHARE = 0.25  # a picture may be this share of a period early
-DEPTH_WAIT_NS = 60_000_000  # longest wait of a picture for its depth
-CONFIRMED_PICTURES = 5  # pictures in a row that show a tag in another size, before a warning
-KEPT_DEPTHS = 4  # newest depth pictures of a camera, to match pictures
+MAX_EARLY_SHARE = 0.25  # of a period; a picture that arrives earlier is skipped
+MAX_DEPTH_WAIT_NS = 60_000_000  # from a picture's arrival to that of its depth
+CONFIRMED_PICTURES = 5  # a warning follows when a tag has another size in so many in a row
+MAX_DEPTHS = 4  # newest depth pictures of a camera, kept until its pictures arrive
 INSTALL = "recognition needs OpenCV; install it with: pip install 'gigabrain-zenoh[eyes]'"
 
 
 @dataclass
-class _Eye:
+class _CameraInput:
     """A camera, its waiting picture, and its newest depth pictures."""
 
     camera: Camera
     due_ns: int = 0  # when its next picture is due
-    picture: Image | None = None  # newest, waiting
+    picture: Image | None = None  # newest one, until it is processed
     received_ns: int = 0  # arrival of that picture
     depths: dict[int, DepthImage] = field(default_factory=dict)  # by basis
-    fault: QuietFault = field(default_factory=lambda: QuietFault(log))  # of its pictures
+    fault: QuietFault = field(default_factory=lambda: QuietFault(log))  # broken pictures
 
     def keep(self, depth: DepthImage) -> None:
         """Keep the depth of an exposure."""
         self.depths[depth.basis] = depth
-        while len(self.depths) > KEPT_DEPTHS:
+        while len(self.depths) > MAX_DEPTHS:
             del self.depths[next(iter(self.depths))]
 
     def depth_of(self, picture: Image) -> DepthImage | None:
@@ -65,52 +65,54 @@ class _Eye:
 
 
 class Recognition:
-    """Follows a body's fixed cameras, on the loop; `observer` runs in a thread."""
+    """Receives the pictures of a body's fixed cameras; `observer` processes them in a thread."""
 
     def __init__(self, config: RecognitionConfig, bus: Bus, observer: "Observer") -> None:
         self._bus, self._observer = bus, observer
         self._period_ns = round(1e9 / config.recognizer.rate_hz)
         self._pool = ThreadPoolExecutor(1, "recognition", initializer=step_aside)
-        self._eyes: dict[str, _Eye] = {}
+        self._inputs: dict[str, _CameraInput] = {}
         self._history = PoseHistory()
-        self._busy, self._closed, self._taken, self._done = False, False, 0, 0
-        self._misread: dict[int, int] = {}  # pictures in a row with another size, by tag
+        self._busy, self._closed, self._received, self._done = False, False, 0, 0
+        self._size_mismatches: dict[int, int] = {}  # pictures in a row with another size, by tag
         self.failed: asyncio.Future[None] = asyncio.get_running_loop().create_future()
         self._pose = bus.latest(POSE)
         bus.latest(BODY, self._on_body)
         bus.latest(STATE, self._on_state)
         bus.subscribe(DEPTH, self._on_depth)
         bus.subscribe(IMAGE, self._on_image)
-        bus.progress = Progress(lambda: (self._taken,) if self._eyes else (), lambda: self._done)
+        bus.progress = Progress(
+            lambda: (self._received,) if self._inputs else (), lambda: self._done
+        )
 
     def close(self) -> None:
-        """Let the thread end after its work; leave one that hangs."""
+        """Let the thread end after its present picture, without waiting for it."""
         self._closed = True
         self._pool.shutdown(wait=False, cancel_futures=True)
 
     def _on_body(self, body: Body) -> None:
-        cameras = {one.name: one for one in body.description.fixed_cameras}
-        if cameras != {name: eye.camera for name, eye in self._eyes.items()}:
-            self._eyes = {name: _Eye(camera) for name, camera in cameras.items()}
+        cameras = {camera.name: camera for camera in body.description.fixed_cameras}
+        if cameras != {name: source.camera for name, source in self._inputs.items()}:
+            self._inputs = {name: _CameraInput(camera) for name, camera in cameras.items()}
 
     def _on_state(self, state: RobotState) -> None:
         self._history = self._history.then(state)
         self._start()
 
     def _on_depth(self, key: str, depth: DepthImage) -> None:
-        if eye := self._eyes.get(key.removeprefix(f"{DEPTH.key}/")):
-            eye.keep(depth)
+        if source := self._inputs.get(key.removeprefix(f"{DEPTH.key}/")):
+            source.keep(depth)
             self._start()
 
     def _on_image(self, key: str, picture: Image) -> None:
-        eye = self._eyes.get(key.removeprefix(f"{IMAGE.key}/"))
+        source = self._inputs.get(key.removeprefix(f"{IMAGE.key}/"))
         now_ns = self._bus.clock.now_ns()
-        if eye is None or now_ns < eye.due_ns - EARLY_SHARE * self._period_ns:
+        if source is None or now_ns < source.due_ns - MAX_EARLY_SHARE * self._period_ns:
             return
         if picture.boot != self._bus.time.boot:
             return
-        eye.picture, eye.received_ns = picture, now_ns
-        self._taken += 1
+        source.picture, source.received_ns = picture, now_ns
+        self._received += 1
         self._start()
 
     def _start(self) -> None:
@@ -118,22 +120,26 @@ class Recognition:
         if self._busy or self._closed:
             return
         now_ns = self._bus.clock.now_ns()
-        for eye in sorted(self._eyes.values(), key=lambda one: one.due_ns):
-            picture = eye.picture
+        for source in sorted(self._inputs.values(), key=lambda source: source.due_ns):
+            picture = source.picture
             if picture is None:
                 continue
-            depth = eye.depth_of(picture)
-            if eye.camera.depth and depth is None and now_ns - eye.received_ns < DEPTH_WAIT_NS:
+            depth = source.depth_of(picture)
+            if (
+                source.camera.depth
+                and depth is None
+                and now_ns - source.received_ns < MAX_DEPTH_WAIT_NS
+            ):
                 continue
-            eye.picture = None
-            eye.due_ns = max(eye.due_ns, now_ns - self._period_ns) + self._period_ns
+            source.picture = None
+            source.due_ns = max(source.due_ns, now_ns - self._period_ns) + self._period_ns
             self._busy = True
-            job = self._pool.submit(self._observer.observe, eye.camera, picture, depth)
-            self._bus.input_log.when_done(job, partial(self._finish, eye, picture))
+            job = self._pool.submit(self._observer.observe, source.camera, picture, depth)
+            self._bus.input_log.when_done(job, partial(self._finish, source, picture))
             return
 
-    def _finish(self, eye: _Eye, picture: Image, job: Job) -> None:
-        name, now_ns = eye.camera.name, self._bus.clock.now_ns()
+    def _finish(self, source: _CameraInput, picture: Image, job: Job) -> None:
+        name, now_ns = source.camera.name, self._bus.clock.now_ns()
         self._busy, self._done = False, self._done + 1
         if self._closed:
             return
@@ -141,12 +147,12 @@ class Recognition:
             found: Detections = job.result()
         except ValueError as error:
             self._bus.counters["broken_pictures"] += 1
-            eye.fault.begin(f"camera {name}: skipped a picture: {error}", now_ns)
-        except Exception as error:  # noqa: BLE001 - handed on whole, to end this process
+            source.fault.begin(f"camera {name}: skipped a picture: {error}", now_ns)
+        except Exception as error:  # noqa: BLE001 - `failed` passes it on, and ends this process
             if not self.failed.done():
                 self.failed.set_exception(error)
         else:
-            eye.fault.end(f"camera {name}: its pictures are whole again", now_ns)
+            source.fault.end(f"camera {name}: its pictures are whole again", now_ns)
             self._publish(found, picture)
             self._warn_of_sizes(found)
         self._start()
@@ -156,9 +162,9 @@ class Recognition:
         measured = self._observer.other_sizes
         for tag in found.tags:
             if tag.id not in measured:
-                self._misread.pop(tag.id, None)
+                self._size_mismatches.pop(tag.id, None)
                 continue
-            times = self._misread[tag.id] = self._misread.get(tag.id, 0) + 1
+            times = self._size_mismatches[tag.id] = self._size_mismatches.get(tag.id, 0) + 1
             if times == CONFIRMED_PICTURES:
                 log.warning(
                     "tag %d measures %.2f m by depth, but its size is set to %.2f m; "
@@ -170,43 +176,43 @@ class Recognition:
         bus = self._bus
         if picture.boot != bus.time.boot:
             return
-        place = self._place(picture.boot, picture.basis)
-        if place:
-            found = in_map(found, place)
+        if body_pose := self._body_pose(picture.boot, picture.basis):
+            found = in_map(found, body_pose)
         bus.latency_ms["recognition"] = found.took_ms
         bus.publish(DETECTIONS, found, basis=picture.basis, stamp_ns=picture.stamp_ns)
 
-    def _place(self, boot: int, tick: int) -> Pose | None:
+    def _body_pose(self, boot: int, tick: int) -> Pose | None:
         """Return the body's pose in the map at `tick`; None if it is not localized."""
-        known: PoseInMap | None = self._pose.fresh()
-        if known is None or not known.localized:
+        newest: PoseInMap | None = self._pose.fresh()
+        if newest is None or not newest.localized:
             return None
-        then, here = self._history.at(boot, known.basis), self._history.at(boot, tick)
-        if then is None or here is None:
+        before, now = self._history.at(boot, newest.basis), self._history.at(boot, tick)
+        if before is None or now is None:
             return None
-        return compose(Pose(x=known.x, y=known.y, yaw=known.yaw), relative(then, here))
+        return compose(Pose(x=newest.x, y=newest.y, yaw=newest.yaw), relative(before, now))
 
 
-def in_map(found: Detections, place: Pose) -> Detections:
-    """Return detections with positions in the map, for a body at `place`."""
+def in_map(found: Detections, body_pose: Pose) -> Detections:
+    """Return detections with positions in the map, for a body at `body_pose` in the map."""
     from gigabrain_zenoh.vision.tags import yaw_of
 
     def at(position: Point) -> Point:
-        x, y = to_parent(place, position[0], position[1])
+        x, y = to_parent(body_pose, position[0], position[1])
         return x, y, position[2]
 
     return replace(
         found,
         things=tuple(
-            replace(one, in_map=at(one.position)) if one.position else one for one in found.things
+            replace(thing, in_map=at(thing.position)) if thing.position else thing
+            for thing in found.things
         ),
         tags=tuple(
             replace(
-                one,
-                in_map=at(one.position),
-                yaw_in_map=wrap_angle(place.yaw + yaw_of(one.orientation)),
+                tag,
+                in_map=at(tag.position),
+                yaw_in_map=wrap_angle(body_pose.yaw + yaw_of(tag.orientation)),
             )
-            for one in found.tags
+            for tag in found.tags
         ),
     )
 

@@ -1,4 +1,4 @@
-"""Finds things and tags in one picture with its depth. Uses no bus and no clock."""
+"""Finds things and tags in one picture with its depth; uses no bus."""
 
 import math
 import time
@@ -21,8 +21,8 @@ from gigabrain_zenoh.vision.thing_places import fits, part_of_wall, thing_place
 
 MAX_THINGS = 128
 MIN_BOX_PX = 1.0
-SAME_BOX_IOU = 0.6  # least intersection over union of two boxes of one thing
-MARGIN = 1 / 8  # of a tag's side
+SAME_THING_IOU = 0.6  # boxes with a larger intersection over union show the same thing
+TAG_MARGIN_SHARE = 1 / 8  # width of a tag's white margin, one cell, as a share of its side
 
 
 class Observer:
@@ -50,18 +50,18 @@ class Observer:
                 f"a picture of {width} x {height} pixels; the body's file says "
                 f"{camera.width} x {camera.height}"
             )
-        model, far = self._model(camera), _depth_of(depth, camera)
+        model, depths = self._model(camera), _depths_of(depth, camera)
         mono = picture.ndim == 2
         grey = picture if mono else _converted(picture, cv2.COLOR_BGR2GRAY)
         to_rgb = cv2.COLOR_GRAY2RGB if mono else cv2.COLOR_BGR2RGB
         found = _find(self._net, _converted(picture, to_rgb), model) if self._net else None
-        tags = self._tags.find(grey, model, far)
-        taken = [_plate(tag) for tag in tags]
+        tags = self._tags.find(grey, model, depths)
+        tag_boxes = [_tag_box(tag) for tag in tags]
         return Detections(
             camera=camera.name,
             width=camera.width,
             height=camera.height,
-            things=_things(found, model, far, taken) if found else (),
+            things=_things(found, model, depths, tag_boxes) if found else (),
             tags=tags,
             took_ms=1e3 * (time.perf_counter() - began),
         )
@@ -78,7 +78,7 @@ class Observer:
 
 
 def _find(net: Net, picture: NDArray[np.uint8], model: CameraModel) -> Found:
-    """Return the net's findings in a picture, which is first rotated upright by quarters."""
+    """Turn a picture upright for the net in steps of 90°; return boxes in the original's pixels."""
     turns = round(math.atan2(-model.rotation[2, 1], model.rotation[2, 2]) / (math.pi / 2)) % 4
     found = net.find(np.ascontiguousarray(np.rot90(picture, turns)))
     boxes = found.boxes
@@ -89,12 +89,15 @@ def _find(net: Net, picture: NDArray[np.uint8], model: CameraModel) -> Found:
     return replace(found, boxes=boxes)
 
 
-def _converted(picture: NDArray[np.uint8], how: int) -> NDArray[np.uint8]:
-    return np.asarray(cv2.cvtColor(picture, how), np.uint8)
+def _converted(picture: NDArray[np.uint8], conversion: int) -> NDArray[np.uint8]:
+    return np.asarray(cv2.cvtColor(picture, conversion), np.uint8)
 
 
-def _depth_of(depth: DepthImage | None, camera: Camera) -> NDArray[np.uint16] | None:
-    """Return the depth of a picture's pixels [mm]; None if it is broken or of another size."""
+def _depths_of(depth: DepthImage | None, camera: Camera) -> NDArray[np.uint16] | None:
+    """Return the depths of pixels [mm], 0 if unknown; None without a picture of this size.
+
+    Raises ValueError for a broken depth picture.
+    """
     if depth is None or (depth.height, depth.width) != (camera.height, camera.width):
         return None
     pixels = depth.array()
@@ -102,10 +105,10 @@ def _depth_of(depth: DepthImage | None, camera: Camera) -> NDArray[np.uint16] | 
     return np.where(usable, pixels, np.uint16(0))
 
 
-def _plate(tag: TagDetection) -> Box:
-    """Return the box round a tag and its margin, one cell wide [px]."""
+def _tag_box(tag: TagDetection) -> Box:
+    """Return the box around a tag and its margin [px]."""
     columns, rows = zip(*tag.corners, strict=True)
-    margin = max(max(columns) - min(columns), max(rows) - min(rows)) * MARGIN
+    margin = max(max(columns) - min(columns), max(rows) - min(rows)) * TAG_MARGIN_SHARE
     return (
         min(columns) - margin, min(rows) - margin, max(columns) + margin, max(rows) + margin,
     )  # fmt: skip
@@ -113,41 +116,41 @@ def _plate(tag: TagDetection) -> Box:
 
 def overlap(one: Box, other: Box) -> float:
     """Return the intersection of two boxes over their union."""
-    wide = min(one[2], other[2]) - max(one[0], other[0])
-    high = min(one[3], other[3]) - max(one[1], other[1])
-    if wide <= 0 or high <= 0:
+    width = min(one[2], other[2]) - max(one[0], other[0])
+    height = min(one[3], other[3]) - max(one[1], other[1])
+    if width <= 0 or height <= 0:
         return 0.0
     areas = sum((box[2] - box[0]) * (box[3] - box[1]) for box in (one, other))
-    return wide * high / (areas - wide * high)
+    return width * height / (areas - width * height)
 
 
 def _things(
-    found: Found, model: CameraModel, depth: NDArray[np.uint16] | None, taken: list[Box]
+    found: Found, model: CameraModel, depths: NDArray[np.uint16] | None, tag_boxes: list[Box]
 ) -> tuple[Detection, ...]:
     """Return the net's findings, most confident first, with positions by depth.
 
-    A thing gets one class: the most confident one whose size fits. Parts of walls and boxes of
-    tags, in `taken`, are no things.
+    A thing gets one class: the most confident one whose size fits. Tags and parts of walls are left
+    out.
     """
-    things, taken = [], list(taken)
-    for label, sure, corners in zip(
+    things, boxes = [], list(tag_boxes)
+    for label, confidence, corners in zip(
         found.names(), found.confidences.tolist(), found.boxes.tolist(), strict=True
     ):
         left, top, right, bottom = corners
         box: Box = (left, top, right, bottom)
         if right - left < MIN_BOX_PX or bottom - top < MIN_BOX_PX:
             continue
-        if any(overlap(box, other) > SAME_BOX_IOU for other in taken):
+        if any(overlap(box, other) > SAME_THING_IOU for other in boxes):
             continue
-        if depth is not None and part_of_wall(label, box, model, depth):
+        if depths is not None and part_of_wall(label, box, model, depths):
             continue
-        place = None if depth is None else thing_place(label, box, model, depth)
+        place = None if depths is None else thing_place(label, box, model, depths)
         if place and not fits(label, place):
             continue
-        taken.append(box)
+        boxes.append(box)
         things.append(Detection(
             label=label,
-            confidence=min(max(sure, 0.0), 1.0),
+            confidence=min(max(confidence, 0.0), 1.0),
             box=box,
             position=place.position if place else None,
             size=place.size if place else None,

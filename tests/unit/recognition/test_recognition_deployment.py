@@ -17,13 +17,13 @@ def names(deployment: Deployment, tmp_path: Path, host: str = "robot") -> list[s
     return [spec.name for spec in process_specs(deployment, host, tmp_path, tmp_path)]
 
 
-def written(tmp_path: Path, text: str) -> Path:
+def write_file(tmp_path: Path, text: str) -> Path:
     path = tmp_path / "robot.yaml"
     path.write_text(text)
     return path
 
 
-def test_it_runs_with_the_cameras_beside_perception_unless_it_is_placed_or_off(tmp_path):
+def test_it_runs_on_the_host_of_perception_if_there_are_cameras_unless_placed_or_off(tmp_path):
     assert "recognition" not in names(Deployment(), tmp_path)
     assert "recognition" in names(Deployment(cameras=True), tmp_path)
     assert "recognition" not in names(Deployment(cameras=True, recognition=False), tmp_path)
@@ -40,18 +40,18 @@ def test_it_runs_with_the_cameras_beside_perception_unless_it_is_placed_or_off(t
     assert names(placed, tmp_path, "eye") == ["recognition"]
 
 
-def test_the_robot_goes_on_without_it(tmp_path):
+def test_the_robot_can_drive_without_it(tmp_path):
     (spec,) = (
-        one
-        for one in process_specs(Deployment(cameras=True), "robot", tmp_path, tmp_path)
-        if one.name == "recognition"
+        spec
+        for spec in process_specs(Deployment(cameras=True), "robot", tmp_path, tmp_path)
+        if spec.name == "recognition"
     )
     assert spec.optional
     assert process_type("recognition").roles == ("robot", "brain")
 
 
-def test_a_deployment_file_names_net_and_tags_beside_itself(tmp_path):
-    path = written(
+def test_paths_in_a_deployment_file_are_relative_to_the_file(tmp_path):
+    path = write_file(
         tmp_path,
         "cameras: on\n"
         "recognizer: {onnx: my.onnx, labels: coco.txt, layout: yolo}\n"
@@ -67,11 +67,11 @@ def test_a_deployment_file_names_net_and_tags_beside_itself(tmp_path):
     )
 
 
-def test_a_net_on_the_command_line_is_taken_from_where_one_is(tmp_path, monkeypatch):
+def test_paths_on_the_command_line_are_relative_to_the_current_folder(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     sets = ("recognizer.layout=detr", "recognizer.labels=my.txt", "recognizer.onnx=my.onnx")
-    made = merged_values({"body": "turtlebot3_waffle"}, (), sets).deployment
-    assert made.recognizer == RecognizerConfig(
+    deployment = merged_values({"body": "turtlebot3_waffle"}, (), sets).deployment
+    assert deployment.recognizer == RecognizerConfig(
         onnx=str(tmp_path / "my.onnx"), labels=str(tmp_path / "my.txt"), layout="detr"
     )
 
@@ -87,13 +87,13 @@ def test_a_net_on_the_command_line_is_taken_from_where_one_is(tmp_path, monkeypa
         ("recognition: maybe", "robot.yaml:1: .*true or false"),
     ],
 )
-def test_what_is_wrong_in_the_file_is_named_with_its_line(tmp_path, line, expected):
+def test_an_error_in_the_file_is_reported_with_its_line(tmp_path, line, expected):
     with pytest.raises(ConfigError, match=expected) as refused:
-        load_deployment(written(tmp_path, line + "\n"))
+        load_deployment(write_file(tmp_path, line + "\n"))
     assert "\n" not in str(refused.value)
 
 
-def test_a_net_that_is_missing_is_refused_before_anything_starts(tmp_path):
+def test_a_missing_net_is_refused_before_any_process_starts(tmp_path):
     recognizer = RecognizerConfig(
         onnx=str(tmp_path / "my.onnx"), labels=str(tmp_path / "my.txt"), layout="yolo"
     )
