@@ -11,23 +11,23 @@ from gigabrain_zenoh.testing.processes import Home, ServiceManager
 
 @pytest.fixture
 def home(tmp_path: Path) -> Iterator[Home]:
-    """Folders for the processes of one test, which end with it."""
-    made = Home(tmp_path)
-    yield made
-    made.close()
+    """Folders for the processes of one test. The processes end with the test."""
+    home = Home(tmp_path)
+    yield home
+    home.close()
 
 
 @pytest.fixture(scope="module")
 def shared_home(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Home]:
     """Folders for processes that the tests of a module share."""
-    made = Home(tmp_path_factory.mktemp("home"))
-    yield made
-    made.close()
+    home = Home(tmp_path_factory.mktemp("home"))
+    yield home
+    home.close()
 
 
 @pytest.fixture
 def site(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
-    """Put a folder of packages on `sys.path`; their modules are removed afterwards."""
+    """Put a folder of packages on `sys.path`; unload their modules afterwards."""
     folder = tmp_path / "site"
     folder.mkdir()
     monkeypatch.syspath_prepend(str(folder))
@@ -40,6 +40,6 @@ def site(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
 @pytest.fixture
 def service_manager(tmp_path: Path) -> Iterator[ServiceManager]:
     """A service manager that listens at `notify` in the test's folder."""
-    made = ServiceManager(f"{tmp_path}/notify")
-    yield made
-    made.close()
+    manager = ServiceManager(f"{tmp_path}/notify")
+    yield manager
+    manager.close()

@@ -46,13 +46,10 @@ BRAIN: dict[str, Node] = {
 
 
 class PatientJournal(InputLogger):
-    """Waits for a node's background work, however slow the machine is.
-
-    For tests that compare results.
-    """
+    """Waits for a node's background work on any machine, for tests that compare results."""
 
     def in_time(self, job: Job, patience_s: float) -> bool:
-        """Wait for `job`, whatever patience the node has; with none it only looks."""
+        """Return whether `job` is done. Wait for it, unless `patience_s` is 0."""
         return done(job, PATIENCE_S if patience_s else 0.0)
 
     def when_done(self, job: Job, then: Callable[[Job], None]) -> None:
@@ -79,7 +76,7 @@ class NodeBench:
 
     def __init__(self, node: Node) -> None:
         self.clock, self.network = FakeClock(), LocalNetwork()
-        self._node, self._read = node, 0
+        self._node, self._read_count = node, 0
         self._ready = asyncio.Event()
 
     async def __aenter__(self) -> Self:
@@ -117,18 +114,18 @@ class NodeBench:
         self.network.deliver(topic.at(), codec.encode(message))
 
     def sent(self, topic: Topic[M]) -> list[M]:
-        """Return what the node has published on `topic` since the last call.
+        """Return the node's messages on `topic` since the last call.
 
-        What it has published on other topics meanwhile is dropped.
+        Its messages on other topics since then are dropped.
         """
-        new = self.network.sent[self._read :]
-        self._read = len(self.network.sent)
+        new = self.network.sent[self._read_count :]
+        self._read_count = len(self.network.sent)
         decode = msgspec.msgpack.Decoder(topic.type).decode
         return [decode(payload) for key, payload in new if key == topic.key]
 
 
 class FreezableTransport(LocalTransport):
-    """A transport of a process that can be frozen; it receives what it missed when it goes on."""
+    """The transport of a process that can be frozen; `thaw` delivers the missed samples."""
 
     def __init__(self, network: LocalNetwork) -> None:
         super().__init__(network)
@@ -136,7 +133,7 @@ class FreezableTransport(LocalTransport):
         self._missed: list[Callable[[], object]] = []
 
     def subscribe(self, key: str, on_sample: OnSample, depth: int) -> Close:
-        """Subscribe as any transport does."""
+        """Subscribe to `key`; samples wait while the process is frozen."""
 
         def receive(key: str, payload: bytes) -> None:
             if self.frozen:
@@ -147,7 +144,7 @@ class FreezableTransport(LocalTransport):
         return super().subscribe(key, receive, depth)
 
     def thaw(self) -> None:
-        """Deliver what was missed."""
+        """Resume the process: deliver the missed samples, and later ones at once."""
         self.frozen = False
         while self._missed:
             self._missed.pop(0)()
@@ -158,7 +155,7 @@ class RecordedBody(MockBody):
 
     def __init__(self, robot: RobotFile, options: MockOptions, run: Run) -> None:
         super().__init__(robot, options, run)
-        self.speeds: list[float] = []  # one per tick, as it was when the tick began
+        self.speeds: list[float] = []  # [m/s], one per tick, at its start
 
     def _advance(self) -> None:
         self.speeds.append(self._velocity.linear_x)
@@ -168,7 +165,7 @@ class RecordedBody(MockBody):
 class RobotInMemory:
     """A robot whose processes are tasks: `async with RobotInMemory(folder) as robot:`.
 
-    Time passes in `go` alone, in ticks of 20 ms.
+    Time passes only in `go`, in ticks of 20 ms.
     """
 
     def __init__(
@@ -185,12 +182,12 @@ class RobotInMemory:
             body="mock", resume=resume, state_dir=str(folder), button=button
         )
         self._running: dict[str, tuple[asyncio.Future[None], Bus]] = {}
-        self._ends: dict[str, FreezableTransport] = {}
+        self._transports: dict[str, FreezableTransport] = {}
         self.state: RobotState | None = None
 
     async def __aenter__(self) -> Self:
         self.operator = Bus(self.network.transport(), self.clock)
-        self.operator.subscribe(STATE, self._see)
+        self.operator.subscribe(STATE, self._on_state)
         for name in BRAIN:
             self.start(name)
         await self.clock.advance(0)
@@ -204,8 +201,8 @@ class RobotInMemory:
 
     def start(self, name: str, make_bus: MakeBus = Bus) -> None:
         """Start one of the brain's processes."""
-        self._ends[name] = FreezableTransport(self.network)
-        bus = make_bus(self._ends[name], self.clock, name)
+        self._transports[name] = FreezableTransport(self.network)
+        bus = make_bus(self._transports[name], self.clock, name)
         self._running[name] = asyncio.ensure_future(BRAIN[name](bus, lambda: None)), bus
 
     def start_driver(self) -> None:
@@ -226,15 +223,15 @@ class RobotInMemory:
         await bus.close()
 
     def freeze(self, name: str) -> None:
-        """Stop one of the brain's processes, as SIGSTOP does."""
-        self._ends[name].frozen = True
+        """Freeze one of the brain's processes, as SIGSTOP does."""
+        self._transports[name].frozen = True
 
     def thaw(self, name: str) -> None:
-        """Let it go on, as SIGCONT does; it receives all that was sent meanwhile."""
-        self._ends[name].thaw()
+        """Resume a frozen process, as SIGCONT does; it receives the missed samples."""
+        self._transports[name].thaw()
 
     async def go(self, ticks: int) -> list[float]:
-        """Let `ticks` pass; return the body's speed in each of them [m/s]."""
+        """Let `ticks` pass; return the body's speed in each tick [m/s]."""
         before = len(self.body.speeds)
         await self.clock.advance(ticks * TICK_NS)
         for task, _ in self._running.values():
@@ -263,15 +260,15 @@ class RobotInMemory:
         """The counters of the driver's bus."""
         return self._running["driver"][1].counters
 
-    def _see(self, _key: str, now: RobotState) -> None:
-        self.state = now
+    def _on_state(self, _key: str, state: RobotState) -> None:
+        self.state = state
 
 
 def ticks_until(speeds: list[float], reached: Callable[[float], bool]) -> int:
-    """Return the first tick in which the body's speed is as wanted, counted from 1."""
+    """Return the number of the first tick whose speed fulfils `reached`, counted from 1."""
     return next(i for i, speed in enumerate(speeds, 1) if reached(speed))
 
 
 def travelled(speeds: list[float]) -> float:
-    """Return the way driven with these speeds [m]."""
+    """Return the distance driven [m] with these speeds per tick [m/s]."""
     return math.fsum(speeds) * TICK_S

@@ -42,7 +42,7 @@ real:
 
 
 class IdealBody:
-    """Has the commanded speed at once, in real time."""
+    """A body that has its commanded speed at once, in real time."""
 
     def __init__(self, robot: RobotFile) -> None:
         self.robot, self.bumper = robot, False
@@ -50,23 +50,23 @@ class IdealBody:
         self._pose, self._yaw = Pose(x=0.0, y=0.0, yaw=0.0), 0.0
         self._angles = [0.0] * (len(self._base.wheels) if self._base else 0)
         self.commanded = (0.0, 0.0, 0.0)
-        self._then_ns = Clock().now_ns()
+        self._updated_ns = Clock().now_ns()
 
     def command(self, linear_x: float, linear_y: float, angular_z: float) -> None:
         """Set its velocity [m/s], [rad/s]."""
-        self._pass()
+        self._advance()
         self.commanded = (linear_x, linear_y, angular_z)
 
     @property
     def snapshot(self) -> Snapshot:
         """Its state now."""
-        self._pass()
+        self._advance()
         x, _, turn = self.commanded
         names = self._base.wheels if self._base else ()
         speeds = self._base.to_wheels(Twist(*self.commanded)) if self._base else ()
         wheels = zip(names, self._angles, speeds, strict=True)
         return Snapshot(
-            time_ns=self._then_ns,
+            time_ns=self._updated_ns,
             odometry=OdometryReading(self._pose.x, self._pose.y, self._yaw, x, turn),
             wheels=tuple(Motor(f"wheel_{n}_joint", a, s, 0.0, 30.0) for n, a, s in wheels),
             imu=ImuSample((0.0, 0.0, 0.0, 1.0), (0.0, 0.0, 0.0), (0.0, 0.0, 9.81)),
@@ -74,9 +74,9 @@ class IdealBody:
             bumper=self.bumper,
         )
 
-    def _pass(self) -> None:
+    def _advance(self) -> None:
         now_ns = Clock().now_ns()
-        seconds, self._then_ns = (now_ns - self._then_ns) / 1e9, now_ns
+        seconds, self._updated_ns = (now_ns - self._updated_ns) / 1e9, now_ns
         step = Twist(*(part * seconds for part in self.commanded))
         self._pose = advance_pose(self._pose, step)
         self._yaw += step.angular_z
@@ -113,34 +113,36 @@ class EmulatedLine:
         return (await self.driver.read_state()).link.connected
 
     async def until_connected(self, wanted: bool = True) -> None:
-        """Wait until the driver has a link, or has none."""
+        """Wait until the driver has a link, or has none if not `wanted`."""
         async with asyncio.timeout(PATIENCE_S):
             while await self.connected() is not wanted:  # noqa: ASYNC110
                 await asyncio.sleep(0.002)
 
-    async def drive_until(self, so: Callable[[RobotState], object], *velocity: float) -> None:
-        """Command a velocity until the reported state fulfils a condition."""
+    async def drive_until(
+        self, condition: Callable[[RobotState], object], *velocity: float
+    ) -> None:
+        """Command a velocity until the reported state fulfils `condition`."""
         async with asyncio.timeout(PATIENCE_S):
-            while not so(await self.driver.read_state()):
+            while not condition(await self.driver.read_state()):
                 await self.drive(0.02, *velocity)
 
-    async def reported(self, so: Callable[[RobotState], object]) -> RobotState:
-        """Return the first reported state that fulfils a condition."""
+    async def reported(self, condition: Callable[[RobotState], object]) -> RobotState:
+        """Return the first reported state that fulfils `condition`."""
         async with asyncio.timeout(PATIENCE_S):
-            while not so(state := await self.driver.read_state()):  # noqa: ASYNC110
+            while not condition(state := await self.driver.read_state()):  # noqa: ASYNC110
                 await asyncio.sleep(0.005)
         return state
 
     async def at_rest(self) -> RobotState:
-        """Return the state at rest, once all of the way has been reported."""
+        """Wait until the body rests and its odometry is reported; return that state."""
         await until(lambda: self.body.commanded == (0.0, 0.0, 0.0))
-        true = self.body.snapshot.odometry
+        actual = self.body.snapshot.odometry
         return await self.reported(
-            lambda state: math.hypot(state.pose.x - true.x, state.pose.y - true.y) < 0.002
+            lambda state: math.hypot(state.pose.x - actual.x, state.pose.y - actual.y) < 0.002
         )
 
     async def drive(self, seconds: float, linear_x: float, angular_z: float = 0.0) -> None:
-        """Command as the driver's process does: every 20 ms."""
+        """Command a velocity every 20 ms, as the driver's process does."""
         for _ in range(math.ceil(seconds / TICK_S)):
             await self.driver.set_base_velocity(linear_x, 0.0, angular_z)
             await asyncio.sleep(0.02)
@@ -151,14 +153,14 @@ async def bench(
     folder: Path, text: str = BARE, plugged: bool = True
 ) -> AsyncIterator[EmulatedLine]:
     """Start driver and firmware, and wait until they are connected unless not `plugged`."""
-    it = EmulatedLine(folder, text)
-    it.station.start()
+    line = EmulatedLine(folder, text)
+    line.station.start()
     if not plugged:
-        it.station.set(type(NO_FAULTS)(unplugged=True))
+        line.station.set(type(NO_FAULTS)(unplugged=True))
     try:
-        async with it.driver:
+        async with line.driver:
             if plugged:
-                await it.until_connected()
-            yield it
+                await line.until_connected()
+            yield line
     finally:
-        await it.station.close()
+        await line.station.close()

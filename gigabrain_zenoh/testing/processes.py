@@ -32,7 +32,7 @@ AVOID = ("demo", "--behaviour", "avoid")  # the quickest demo to start
 GIGABRAIN = (sys.executable, "-P", "-c", "from gigabrain_zenoh.cli.app import main; main()")
 
 
-PROGRAM = """
+ROUTER_PROGRAM = """
 import json, signal, sys, zenoh
 config = zenoh.Config()
 for key, value in json.loads(sys.argv[1]).items():
@@ -130,7 +130,7 @@ class Home:
 
     @property
     def environment(self) -> dict[str, str]:
-        """The environment of processes that live in these folders."""
+        """The environment of the processes, with their folders."""
         return os.environ | {
             "PYTHONPATH": os.pathsep.join(SOURCES),
             "XDG_STATE_HOME": str(self.folder / "state"),
@@ -161,12 +161,12 @@ class Home:
         return path
 
     def processes(self, name: str = "") -> list[int]:
-        """Return the pids of the supervised processes that live here, or of those of this name."""
-        mine = f'"run_dir":"{self.folder}', f'"name":"{name}"' if name else ""
-        return [pid for pid, arguments in _processes() if all(one in arguments for one in mine)]
+        """Return the pids of the supervised processes of this home, or of those called `name`."""
+        marks = f'"run_dir":"{self.folder}', f'"name":"{name}"' if name else ""
+        return [pid for pid, arguments in _processes() if all(mark in arguments for mark in marks)]
 
     def close(self) -> None:
-        """End all processes that are left."""
+        """End all remaining processes."""
         for command in self._commands:
             command.close()
         for pid in self.processes():
@@ -177,7 +177,7 @@ def _processes() -> Iterator[tuple[int, str]]:
     """Yield the pid and the arguments of each process of this machine."""
     if Path("/proc/self/cmdline").exists():
         for folder in Path("/proc").glob("[0-9]*"):
-            with contextlib.suppress(OSError):  # it has just ended
+            with contextlib.suppress(OSError):  # the process has ended
                 yield int(folder.name), (folder / "cmdline").read_text(errors="replace")
         return
     listed = subprocess.run(("ps", "-ww", "-A", "-o", "pid=,args="), capture_output=True, text=True)
@@ -234,7 +234,7 @@ class RouterProcess:
     def __init__(self, endpoint: str) -> None:
         config = json.dumps(session_config(Endpoint(listen=(endpoint,))))
         self._process = subprocess.Popen(
-            (sys.executable, "-c", PROGRAM, config), stdout=subprocess.PIPE, text=True
+            (sys.executable, "-c", ROUTER_PROGRAM, config), stdout=subprocess.PIPE, text=True
         )
         assert self._process.stdout
         assert self._process.stdout.readline() == "up\n"
@@ -296,18 +296,18 @@ class ZenohNetwork:
         return transport
 
     async def close(self) -> None:
-        """Close all of them."""
+        """Close the router and all clients."""
         await self._stack.aclose()
 
 
 @contextlib.asynccontextmanager
 async def robot() -> AsyncIterator[ZenohNetwork]:
-    """Close all sessions of a network at the end of the context."""
-    made = ZenohNetwork()
+    """Yield a network; close all its sessions at the end of the context."""
+    network = ZenohNetwork()
     try:
-        yield made
+        yield network
     finally:
-        await made.close()
+        await network.close()
 
 
 def session_threads() -> set[threading.Thread]:
@@ -334,8 +334,8 @@ class SampleCollector:
 async def repeat(send: Callable[[], object], received: Callable[[], object]) -> None:
     """Send every 50 ms until it is received.
 
-    Subscriptions take a while to spread. On a machine that starves a process for the 400 ms of a
-    lease, a link is lost for a moment.
+    Other processes learn of a new subscription only after a while. A process that a busy machine
+    stops for the 400 ms of a lease loses its link for a moment.
     """
     async with asyncio.timeout(30):
         while not received():

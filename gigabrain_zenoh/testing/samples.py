@@ -84,7 +84,7 @@ def scan(
     angle_increment: float | None = None,
     boot: int = BOOT,
 ) -> LaserScan:
-    """Return a scan of `values` [m], all the way round unless the angles are given."""
+    """Return a scan with the ranges `values` [m], over a full turn unless angles are given."""
     return LaserScan(
         angle_min=angle_min,
         angle_increment=2 * math.pi / len(values) if angle_increment is None else angle_increment,
@@ -98,7 +98,7 @@ def scan(
 
 
 def open_space(**hits_at_degrees: float) -> NDArray[np.float32]:
-    """Return 360 ranges a degree apart, infinite but for those given: `deg_15=0.8`."""
+    """Return 360 ranges [m], one per degree: infinite, except those given as `deg_15=0.8`."""
     values = np.full(360, np.inf, "f4")
     for name, distance in hits_at_degrees.items():
         values[int(name.removeprefix("deg_"))] = distance
@@ -106,7 +106,7 @@ def open_space(**hits_at_degrees: float) -> NDArray[np.float32]:
 
 
 def round_room(radius: float, x: float, y: float, yaw: float) -> Floats:
-    """Return 360 ranges from (x, y, yaw) in a round room: |p + d u| = radius, solved for d."""
+    """Return 360 ranges d [m] from p = (x, y), yaw in a round room: |p + d u| = radius."""
     angles = yaw + np.radians(np.arange(360.0))
     along: Floats = x * np.cos(angles) + y * np.sin(angles)
     return np.sqrt(along**2 + radius**2 - x**2 - y**2) - along
