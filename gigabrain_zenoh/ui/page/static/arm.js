@@ -1,13 +1,13 @@
-// The joints of an arm: where they are in their ranges, and buttons that move one while they are held.
+// The joints of an arm: their positions, and buttons that move a joint while they are held.
 import { makeElement, setText } from './panels.js'
 
 const PERIOD_MS = 40
-const TOOL_SPEED = 0.3 // [m/s] at most
+const MAX_TOOL_SPEED = 0.3 // [m/s]
 const AXES = ['x', 'y', 'z'] // of the base
-const AT_REST_SPEED = 0.05 // [rad/s] or [m/s]
+const MIN_MOVING_SPEED = 0.05 // [rad/s] or [m/s]
 const LIMP = 'limp: let go of, so it may fall; “Hold” holds it'
 
-/** Return a position or a speed of a joint as text: degrees, or millimetres where it slides. */
+/** Return the position or the speed of a joint as text: in degrees, or in millimetres for a sliding joint. */
 function inUnit(joint, value, suffix = '') {
   const [factor, unit] = joint.unit === 'm' ? [1000, ' mm'] : [180 / Math.PI, '°']
   return `${(value * factor).toFixed(1)}${unit}${suffix}`
@@ -16,10 +16,10 @@ function inUnit(joint, value, suffix = '') {
 function activity(state) {
   if (!state) return 'silent'
   if (state.limp) return LIMP
-  return state.joints.some(({ velocity }) => Math.abs(velocity) > AT_REST_SPEED) ? 'moving' : 'held'
+  return state.joints.some(({ velocity }) => Math.abs(velocity) > MIN_MOVING_SPEED) ? 'moving' : 'held'
 }
 
-/** Return where the tool is as text: x, y, z in centimetres, and how far it points down. */
+/** Return the tool's place as text: x, y, z in centimetres, and its pitch. */
 export function toolText(tool) {
   if (!tool) return ''
   const [x, y, z, pitch] = tool, down = (pitch * 180) / Math.PI
@@ -27,9 +27,9 @@ export function toolText(tool) {
   return `tool at ${place} cm, ${Math.abs(down).toFixed(0)}° ${down < 0 ? 'up' : 'down'}`
 }
 
-/** The buttons that hold an arm and let go of it; the second asks a person first. */
+/** The buttons that hold an arm and let it go limp. The second one asks for confirmation. */
 export class ArmHold {
-  /** `request(what, more)` sends a request; the rest are the buttons, and the question with its answers. */
+  /** `request(what, more)` sends a request. The other arguments are elements: buttons, and the question `ask` with its answers. */
   constructor({ hold, limp, ask, yes, no, request }) {
     Object.assign(this, { hold, limp, ask })
     hold.addEventListener('click', () => request('hold'))
@@ -38,7 +38,7 @@ export class ArmHold {
     yes.addEventListener('click', () => { ask.hidden = true; request('limp', { value: 'yes' }) })
   }
 
-  /** Offer what does something in this state, or nothing without one. */
+  /** Enable the buttons that have an effect in this state; without a state, none. */
   setState(state) {
     const mode = state?.gate.mode, shut = mode === 'idle' || mode === 'latched'
     this.hold.disabled = !(state?.limp ? shut : mode === 'enabled')
@@ -52,20 +52,20 @@ export class ArmHold {
 export class Arm {
   #joints = []
   #rows = new Map() // by joint
-  #held = new Map() // by button that is held: the joint or the axis of the tool, and 1 or -1
-  #sent = [] // what was held when speeds were sent last
+  #held = new Map() // by held button: a joint or an axis of the tool, and the direction, 1 or -1
+  #sent = [] // values of `held` at the last command
 
-  /** `send(speeds, tool)` sends speeds of joints and of the tool, `allowed()` says whether they may be moved now. */
+  /** `send(speeds, tool)` sends speeds of joints and of the tool, `allowed()` returns whether they may move now. */
   constructor({ list, tool, speedShare, send, allowed, show }) {
     Object.assign(this, { list, speedShare, send, allowed, show })
     tool.append('tool', ...AXES.flatMap((name, axis) => [
-      this.#makeButton({ axis, way: -1 }, `tool ${name}`, '−'), makeElement('span', name), this.#makeButton({ axis, way: 1 }, `tool ${name}`, '+'),
+      this.#makeButton({ axis, direction: -1 }, `tool ${name}`, '−'), makeElement('span', name), this.#makeButton({ axis, direction: 1 }, `tool ${name}`, '+'),
     ]))
     setInterval(() => this.#sendWanted(), PERIOD_MS)
   }
 
-  /** Show these joints, as their description has them. */
-  know(joints) {
+  /** Show these joints of the body's description. */
+  setJoints(joints) {
     if (JSON.stringify(joints) === JSON.stringify(this.#joints)) return
     this.releaseAll()
     this.#joints = joints
@@ -73,7 +73,7 @@ export class Arm {
     this.list.replaceChildren(...[...this.#rows.values()].map(({ row }) => row))
   }
 
-  /** Show the newest state, or none. */
+  /** Show the newest state; null if there is none. */
   setState(state) {
     this.list.classList.toggle('off', !this.allowed())
     this.#joints.forEach((joint, i) => this.#fill(joint, state?.joints.find(({ name }) => name === joint.name), state?.joints_sent[i]))
@@ -91,9 +91,9 @@ export class Arm {
     if (!held.length && !this.#sent.length) return
     const all = [...this.#sent, ...held], speeds = {}, tool = all.some(({ axis }) => axis != null) ? [0, 0, 0] : undefined
     for (const { joint } of all) if (joint) speeds[joint.name] = 0
-    for (const { joint, axis, way } of held) {
-      if (joint) speeds[joint.name] += way * this.speedShare() * joint.max_speed
-      else tool[axis] += way * this.speedShare() * TOOL_SPEED
+    for (const { joint, axis, direction } of held) {
+      if (joint) speeds[joint.name] += direction * this.speedShare() * joint.max_speed
+      else tool[axis] += direction * this.speedShare() * MAX_TOOL_SPEED
     }
     this.#sent = held
     this.send(speeds, tool)
@@ -103,22 +103,22 @@ export class Arm {
   }
 
   #makeRow(joint) {
-    const row = makeElement('li', '', 'joint'), range = makeElement('i', '', 'range'), sent = makeElement('s'), here = makeElement('b')
+    const row = makeElement('li', '', 'joint'), range = makeElement('i', '', 'range'), setpointMark = makeElement('s'), positionMark = makeElement('b')
     const number = makeElement('output', '–'), more = makeElement('small')
     range.setAttribute('role', 'meter')
     range.setAttribute('aria-label', joint.name)
     range.setAttribute('aria-valuemin', joint.lower)
     range.setAttribute('aria-valuemax', joint.upper)
     range.title = `${inUnit(joint, joint.lower)} to ${inUnit(joint, joint.upper)}`
-    range.append(sent, here)
-    const button = (way, text) => this.#makeButton({ joint, way }, joint.name, text)
+    range.append(setpointMark, positionMark)
+    const button = (direction, text) => this.#makeButton({ joint, direction }, joint.name, text)
     row.append(button(-1, '−'), makeElement('span', joint.name), number, range, more, button(1, '+'))
-    return { row, range, sent, here, number, more }
+    return { row, range, setpointMark, positionMark, number, more }
   }
 
   #makeButton(moves, name, text) {
     const button = makeElement('button', text, 'jog')
-    button.setAttribute('aria-label', `${name} ${moves.way > 0 ? 'up' : 'down'}: hold to move it`)
+    button.setAttribute('aria-label', `${name} ${moves.direction > 0 ? 'up' : 'down'}: hold to move it`)
     const hold = () => { this.#held.set(button, moves); this.#sendWanted() }
     const release = () => { if (this.#held.delete(button)) this.#sendWanted() }
     button.addEventListener('pointerdown', (event) => {
@@ -133,15 +133,15 @@ export class Arm {
     return button
   }
 
-  #fill(joint, measured, sentTo) {
-    const { range, sent, here, number, more } = this.#rows.get(joint.name)
+  #fill(joint, measured, setpoint) {
+    const { range, setpointMark, positionMark, number, more } = this.#rows.get(joint.name)
     const share = (position) => `${100 * Math.min(1, Math.max(0, (position - joint.lower) / (joint.upper - joint.lower)))}%`
-    here.hidden = !measured
-    sent.hidden = !measured || sentTo == null
-    if (sentTo != null) sent.style.left = share(sentTo)
+    positionMark.hidden = !measured
+    setpointMark.hidden = !measured || setpoint == null
+    if (setpoint != null) setpointMark.style.left = share(setpoint)
     setText(number, measured ? inUnit(joint, measured.position) : '–')
     if (!measured) return range.removeAttribute('aria-valuenow')
-    here.style.left = share(measured.position)
+    positionMark.style.left = share(measured.position)
     range.setAttribute('aria-valuenow', measured.position)
     range.setAttribute('aria-valuetext', number.textContent)
     const { effort, temperature, current } = measured, force = joint.unit === 'm' ? 'N' : 'N m'

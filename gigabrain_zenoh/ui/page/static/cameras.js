@@ -1,9 +1,9 @@
 // Pictures of the cameras, with what was recognised drawn over them. Pictures are sent only while the panel is open.
 import { $, makeElement, setText } from './panels.js'
 
-const SILENT_AFTER_MS = 1500, FOUND_FOR_MS = 1000
-const MAX_CAMERAS = 16 // as the server takes
-const ARIA_EVERY_MS = 2000 // between two descriptions for screen readers
+const SILENT_AFTER_MS = 1500, FOUND_SHOWN_MS = 1000
+const MAX_CAMERAS = 16 // the limit of the server
+const ARIA_INTERVAL_MS = 2000 // between two descriptions for screen readers
 const LINE_PX = 2, TEXT_PX = 12 // on the screen
 const CHANNELS = { rgb8: [0, 1, 2], bgr8: [2, 1, 0], mono8: [0, 0, 0] }
 const distance = ([x, y]) => `${Math.hypot(x, y).toFixed(1)} m`
@@ -13,7 +13,7 @@ export class Cameras {
   #open = false
   #boxes = true
 
-  /** `watch(wanted)` says which pictures are wanted, `shown(camera)` that the last one has been drawn. */
+  /** `watch(wanted)` requests pictures; `shown(camera)` reports that the last one is drawn. */
   constructor({ watch, shown }) {
     Object.assign(this, { watch, shown })
     $('show-cameras').addEventListener('click', () => this.open(!this.#open))
@@ -34,14 +34,14 @@ export class Cameras {
     this.resume()
   }
 
-  /** Say again what is wanted, as after a new connection. */
+  /** Request the wanted pictures again, for example after a new connection. */
   resume() {
     const folded = [...this.#views].filter(([, view]) => view.folded).map(([name]) => name)
     this.watch({ open: this.#open && !document.hidden && this.#views.size > 0, folded })
   }
 
-  /** Show a panel for each of the body's cameras, and for those that publish anyway. */
-  know(names) {
+  /** Add a panel for each new camera: those of the body, and others that publish pictures. */
+  add(names) {
     const before = this.#views.size
     for (const name of names) this.#viewOf(name)
     if (this.#views.size > before) this.resume()
@@ -49,17 +49,17 @@ export class Cameras {
   }
 
   setProblem({ camera, problem }) {
-    this.know([camera])
+    this.add([camera])
     const view = this.#viewOf(camera)
     if (!view) return
     view.reported = problem
     this.#showProblem(view)
   }
 
-  /** Take what perception thinks of the cameras. */
+  /** Show the problems that perception reports. */
   setStatus(cameras) {
     for (const { name, ok, problem } of cameras) {
-      this.know([name])
+      this.add([name])
       const view = this.#viewOf(name), blind = ok ? '' : problem || 'cannot be believed'
       if (!view || view.blind === blind) continue
       view.blind = blind
@@ -95,7 +95,7 @@ export class Cameras {
     this.#drawFound(view)
   }
 
-  /** Return the panel of a camera, new or not; undefined if there are too many. */
+  /** Return the panel of a camera, which may be new; undefined if there are too many. */
   #viewOf(camera) {
     if (!this.#views.has(camera) && this.#views.size < MAX_CAMERAS) this.#views.set(camera, this.#makeView(camera))
     return this.#views.get(camera)
@@ -113,7 +113,7 @@ export class Cameras {
     large.title = 'larger or smaller'
     caption.append(fold)
     figure.append(caption, large, problem)
-    const view = { camera, figure, fold, large, picture, overlay, problem, folded: false, openedMs: performance.now(), pictureMs: 0, foundMs: 0, ariaMs: -ARIA_EVERY_MS, reported: '', blind: '', broken: '' }
+    const view = { camera, figure, fold, large, picture, overlay, problem, folded: false, openedMs: performance.now(), pictureMs: 0, foundMs: 0, ariaMs: -ARIA_INTERVAL_MS, reported: '', blind: '', broken: '' }
     fold.addEventListener('click', () => { view.folded = !view.folded; this.#layOut(view); this.resume() })
     large.addEventListener('click', () => { figure.classList.toggle('large'); this.#layOut(view) })
     this.#layOut(view)
@@ -130,7 +130,7 @@ export class Cameras {
   }
 
   #drawFound(view) {
-    const { overlay, found } = view, current = this.#boxes && found && performance.now() - view.foundMs < FOUND_FOR_MS
+    const { overlay, found } = view, current = this.#boxes && found && performance.now() - view.foundMs < FOUND_SHOWN_MS
     const ratio = devicePixelRatio || 1, { clientWidth: width, clientHeight: height } = overlay
     overlay.width = Math.max(1, width * ratio)
     overlay.height = Math.max(1, height * ratio)
@@ -148,7 +148,7 @@ export class Cameras {
   }
 
   #describe(view) {
-    if (performance.now() - view.ariaMs < ARIA_EVERY_MS) return
+    if (performance.now() - view.ariaMs < ARIA_INTERVAL_MS) return
     view.ariaMs = performance.now()
     const names = [...view.found.things.map(({ label }) => label), ...view.found.tags.map(({ id }) => `tag ${id}`)]
     view.large.setAttribute('aria-label', `Picture of camera ${view.camera}: ${names.join(', ') || 'nothing recognised'}`)
@@ -158,7 +158,7 @@ export class Cameras {
     if (!this.#open || document.hidden) return
     for (const view of this.#views.values()) {
       this.#showProblem(view)
-      if (view.found && performance.now() - view.foundMs > FOUND_FOR_MS) { view.found = null; this.#drawFound(view) }
+      if (view.found && performance.now() - view.foundMs > FOUND_SHOWN_MS) { view.found = null; this.#drawFound(view) }
     }
   }
 

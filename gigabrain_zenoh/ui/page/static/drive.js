@@ -1,4 +1,4 @@
-// Joystick, keys and gamepad. Sends commands only while something is held, and one zero at the end.
+// Joystick, keys and gamepad. Sends commands only while one of them is held, and one zero at the end.
 const PERIOD_MS = 40
 const KEYS = {
   KeyW: [1, 0, 0], ArrowUp: [1, 0, 0], KeyS: [-1, 0, 0], ArrowDown: [-1, 0, 0],
@@ -13,8 +13,8 @@ export class Drive {
   #held = new Set()
   #stick = null // [x, z] while it is held
   #sending = false
-  #padWaits = false // for its shoulder buttons to be released
-  #stopsPressed = 0 // on all gamepads
+  #padIgnored = false // until its shoulder buttons are released
+  #stopsPressed = 0 // number of held stop buttons of all gamepads
 
   /** `limits()` returns the highest speeds, `send(x, y, z)` sends a velocity, `stop()` is the e-stop. */
   constructor({ stick, speedShare, limits, send, stop, allowed, show }) {
@@ -27,7 +27,7 @@ export class Drive {
   /** Count all keys, the joystick and gamepads as released. */
   releaseAll() {
     this.#held.clear()
-    this.#padWaits = true
+    this.#padIgnored = true
     this.#centreStick()
     this.#sendWanted()
   }
@@ -50,7 +50,7 @@ export class Drive {
     return sum.some(Boolean) ? sum.map(Math.sign) : this.#gamepadAxes()
   }
 
-  /** Stop once for each press of a gamepad's stop button, whatever else is held. */
+  /** Stop once for each press of a gamepad's stop button, also while keys or the joystick are held. */
   #readStopButtons() {
     const pressed = gamepads().filter(({ buttons }) => buttons[STOP_BUTTON]?.pressed).length
     if (pressed > this.#stopsPressed) this.stop()
@@ -60,8 +60,8 @@ export class Drive {
   #gamepadAxes() {
     const [pad] = gamepads()
     const held = pad && SHOULDER_BUTTONS.some((n) => pad.buttons[n]?.pressed)
-    this.#padWaits = held && (this.#padWaits || !document.hasFocus()) // another window may show another robot
-    if (!held || this.#padWaits) return [0, 0, 0]
+    this.#padIgnored = held && (this.#padIgnored || !document.hasFocus()) // another window may show another robot
+    if (!held || this.#padIgnored) return [0, 0, 0]
     const axis = (n) => (Math.abs(pad.axes[n] ?? 0) < DEAD_ZONE ? 0 : -pad.axes[n])
     return [axis(1), axis(0), axis(2)]
   }
@@ -93,7 +93,7 @@ export class Drive {
       const knob = this.stick.firstElementChild
       knob.style.transform = `translate(${(right / length) * radius * 0.7}px, ${(down / length) * radius * 0.7}px)`
     }
-    this.stick.addEventListener('contextmenu', (event) => event.preventDefault()) // which hides the release
+    this.stick.addEventListener('contextmenu', (event) => event.preventDefault()) // the menu would hide the release
     this.stick.addEventListener('pointerdown', (event) => {
       if (event.button > 0) return
       this.stick.setPointerCapture(event.pointerId)

@@ -1,9 +1,9 @@
 // Layers drawn in the robot's frame. Each function takes the canvas context and the map view.
 const TAU = 2 * Math.PI
-const LINE_TIME_S = 1 // the line of a moving obstacle reaches to its place after this time
-const MIN_SPEED = 0.05 // [m/s] below it an obstacle has no line
-const MIN_WALL_RADIUS_M = 0.3 // larger obstacles at rest are drawn as the points seen of them
-const MAX_POINT_GAP_M = 0.25 // between two neighbouring points on one obstacle
+const LINE_TIME_S = 1 // the line of a moving obstacle ends at its predicted place after this time
+const MIN_SPEED = 0.05 // [m/s], slower obstacles have no line
+const MIN_WALL_RADIUS_M = 0.3 // larger obstacles at rest are drawn as their scan points
+const MAX_POINT_GAP_M = 0.25 // between two neighbouring points of one obstacle
 
 /** Paint the distance to the nearest obstacle in each sector. */
 function paintSectors(pen, view) {
@@ -68,7 +68,7 @@ export const toFrameOf = ({ x, y, yaw }) => {
 
 /** Paint the obstacles that perception tracks, which are in the odometry frame.
 
-Large ones at rest, such as walls, are drawn as the points seen of them, all others as discs. */
+Large ones at rest, such as walls, are drawn as their scan points, all others as discs. */
 function paintObstacles(pen, view) {
   const { world, state, pose } = view.robot
   if (!state || !pose) return

@@ -3,9 +3,9 @@ const ABOUT = 1, STATE = 2, SCAN = 3, MAP = 4, HEALTH = 5, LOG = 6, REPLY = 7, I
 const CAMERA = 13, FOUND = 14, CONTOURS = 15, PERCEIVED = 16, OBJECTS = 17, ARM_PLAN = 18
 const LOGIN = 1, DRIVE = 2, ASK = 3, WATCH = 4, SHOWN = 5, JOG = 6
 const SILENT_AFTER_MS = 1000, RETRY_MS = [300, 600, 1200, 2500], FULL_RETRY_MS = 5000
-const CHECK_MS = 250, MAX_SILENT_CHECKS = 80 // 20 s; checks are counted, as a page that is held up receives nothing
-// longer than the server waits for the robot, so that its answer says what has become of a request
-const ANSWER_MS = 3000, ANSWERS_MS = { estop: 2500, world: 5000, zones: 8000, maps: 25_000, map_save: 25_000, map_load: 25_000 }
+const CHECK_MS = 250, MAX_SILENT_CHECKS = 80 // 20 s; checks are counted, as a suspended page receives nothing
+// longer than the server waits for the robot, so that the page still gets its answer
+const ANSWER_TIMEOUT_MS = 3000, ANSWER_TIMEOUTS_MS = { estop: 2500, world: 5000, zones: 8000, maps: 25_000, map_save: 25_000, map_load: 25_000 }
 const WRONG_TOKEN = 4401, FULL = 4429 // codes of a closed WebSocket
 
 const decoder = new TextDecoder(), encoder = new TextEncoder()
@@ -14,11 +14,11 @@ export class Link {
   #socket = null
   #failures = 0 // connections in a row that failed
   #lastId = 0
-  #pending = new Map() // by the id of a request: what resolves it
+  #pending = new Map() // by the id of a request: the function that resolves it
   #receivedMs = 0
   #silentChecks = 0
 
-  /** `on` has about, robot, scan, map, task, health, log, image, camera, found, contours, perceived, objects, armPlan, scene, poses, zones, reply, connection(status) and login(). */
+  /** `on` has the handlers about, robot, scan, map, task, health, log, image, camera, found, contours, perceived, objects, armPlan, scene, poses, zones, reply, connection(status) and login(). */
   constructor(on, token) {
     this.on = on
     this.token = token
@@ -48,15 +48,15 @@ export class Link {
   }
 
   /** Send the speeds of joints, and that of the tool. */
-  jog(speeds, tool) { this.#tell(JOG, { speeds, tool }) }
+  jog(speeds, tool) { this.#send(JOG, { speeds, tool }) }
 
-  /** Say which pictures are wanted. */
-  watch(wanted) { this.#tell(WATCH, wanted) }
+  /** Tell the server which pictures are wanted. */
+  watch(wanted) { this.#send(WATCH, wanted) }
 
-  /** Say that a camera's picture has been shown, so that the next one may come. */
-  shown(camera) { this.#tell(SHOWN, { camera }) }
+  /** Tell the server that a camera's picture is shown, so that it may send the next one. */
+  shown(camera) { this.#send(SHOWN, { camera }) }
 
-  #tell(kind, content) {
+  #send(kind, content) {
     if (this.#socket.readyState === WebSocket.OPEN) this.#socket.send(this.#frame(kind, content))
   }
 
@@ -69,7 +69,7 @@ export class Link {
     this.#socket.send(this.#frame(ASK, { id, what, ...more }))
     return new Promise((resolve) => {
       const finish = (reply) => { this.#pending.delete(id); clearTimeout(timer); resolve(reply) }
-      const timer = setTimeout(() => finish({ ok: false, text: 'no answer' }), ANSWERS_MS[what] ?? ANSWER_MS)
+      const timer = setTimeout(() => finish({ ok: false, text: 'no answer' }), ANSWER_TIMEOUTS_MS[what] ?? ANSWER_TIMEOUT_MS)
       this.#pending.set(id, finish)
     })
   }
@@ -126,7 +126,7 @@ export class Link {
     if (this.#silentChecks > MAX_SILENT_CHECKS && this.#socket.readyState < WebSocket.CLOSING) this.#abandon()
   }
 
-  /** Replace a connection whose end is not reported, as of a robot that has lost its power. */
+  /** Replace a connection whose end is not reported, for example when the robot loses its power. */
   #abandon() {
     this.#socket.onmessage = this.#socket.onclose = null
     this.#socket.close()

@@ -1,4 +1,4 @@
-// Loads the page again when one of its files did not arrive: without it, nothing of the page runs.
+// Reloads the page if one of its files did not arrive: without that file, the page does not work.
 const RELOAD_AFTER_MS = 1000
 let reloads = false
 

@@ -11,16 +11,16 @@ import { Settings } from './settings.js'
 import { WorldView } from './world_view.js'
 import { Zones } from './zones.js'
 
-const ARM_DISTANCE_M = 0.9 // from which an arm is seen
-const NARROW_PX = 860 // below, the page is that of a phone; see style.css
-const BY_HAND = 'press the hardware e-stop or cut the power'
+const ARM_DISTANCE_M = 0.9 // from the camera to an arm
+const NARROW_PX = 860 // narrower pages have the layout of a phone; see style.css
+const STOP_BY_HAND = 'press the hardware e-stop or cut the power'
 const stored = (key) => { try { return sessionStorage.getItem(key) ?? '' } catch { return '' } }
-const decoded = (text) => { try { return decodeURIComponent(text) } catch { return text } } // no % of a URL
+const decoded = (text) => { try { return decodeURIComponent(text) } catch { return text } } // a % that begins no URL escape
 const store = (key, value) => { try { sessionStorage.setItem(key, value) } catch { /* private mode */ } }
 
 let about = { role: 'operator', body: null }
 let robot = null // its present state
-let lost = false // the connection; the next one may be to another run of the robot
+let connectionLost = false // the next connection may be to another run of the robot
 
 const token = decoded(location.hash.slice(1))
 if (token) { store('token', token); history.replaceState(null, '', location.pathname) }
@@ -41,12 +41,12 @@ const link = new Link({
   about(info) {
     const first = !about.body
     about = info
-    if (lost) forget()
-    lost = false
+    if (connectionLost) forget()
+    connectionLost = false
     map.body = info.body
     setText($('robot'), info.body ? `${info.body.robot_type} · ${info.link}` : 'gigabrain')
     document.title = `${info.body?.robot_type ?? 'gigabrain'}${viewOnly() ? ' (view only)' : ''}`
-    cameras.know((info.body?.cameras ?? []).map(({ name }) => name))
+    cameras.add((info.body?.cameras ?? []).map(({ name }) => name))
     if (first && info.body?.cameras.length && innerWidth > NARROW_PX) cameras.open(true)
     else cameras.resume()
     showDrives(info.body)
@@ -75,7 +75,7 @@ const link = new Link({
   },
   health(health) {
     showHealth(health)
-    cameras.know(publishedCameras())
+    cameras.add(publishedCameras())
   },
   log: showLogLine,
   image: (data) => cameras.image(data),
@@ -99,7 +99,7 @@ const link = new Link({
     $('link').classList.toggle('live', live)
     document.body.classList.toggle('silent', !live)
     if (!live) {
-      lost ||= status === 'offline'
+      connectionLost ||= status === 'offline'
       releaseAll()
       robot = null
       arm.setState(null)
@@ -143,22 +143,22 @@ const armHold = new ArmHold({
 
 onLostRelease(releaseAll)
 
-/** Forget what a server sends only when it changes, and at the begin of a connection. */
+/** Forget the data that a server sends only on changes, and at the start of a connection. */
 function forget() {
   map.forget()
   zones.set({ zones: [], places: [], map: '' })
   objects.set({ objects: [], tags: [] })
 }
 
-/** Show what moves this body: its base, its joints, or both. */
+/** Show the controls of this body: for its base, its joints, or both. */
 function showDrives(body) {
-  arm.know(body?.joints ?? [])
+  arm.setJoints(body?.joints ?? [])
   $('arm').hidden = !body?.joints.length
   document.body.classList.toggle('arm-alone', isArmAlone())
   showWorldOfArm()
 }
 
-/** Show an arm without a base in three dimensions: a map says nothing of it. */
+/** Show an arm without a base in three dimensions, as a map cannot show it. */
 function showWorldOfArm() {
   if (!isArmAlone() || !world.scene || world.shown) return
   world.closeTo(ARM_DISTANCE_M)
@@ -186,7 +186,7 @@ async function stop() {
   show($('confirmed'), 'stopping …', '')
   const reply = await link.request('estop')
   if (reply.ok) return show($('confirmed'), `CONFIRMED by ${reply.robot} in ${(performance.now() - startMs).toFixed(0)} ms: ${reply.text}`, 'ok')
-  const text = reply.not_confirmed ? reply.text : `NOT CONFIRMED: ${reply.text}; ${BY_HAND}`
+  const text = reply.not_confirmed ? reply.text : `NOT CONFIRMED: ${reply.text}; ${STOP_BY_HAND}`
   show($('confirmed'), text, 'bad')
 }
 
@@ -204,7 +204,7 @@ function showReply(reply) {
 
 function sendGoal({ x, y, yaw }) { return requestGoal({ x, y, yaw }, { x, y, yaw }) }
 
-/** Send a goal; `place` is where it is drawn until the robot has answered. */
+/** Send a goal. It is drawn at `place` until the robot answers. */
 async function requestGoal(goal, place) {
   if (viewOnly()) return
   map.goal = place
@@ -221,7 +221,7 @@ function show(element, text, kind) {
 }
 
 $('estop').addEventListener('pointerdown', (event) => { event.preventDefault(); stop() })
-$('estop').addEventListener('click', (event) => { if (event.detail === 0) stop() }) // by keyboard or by a screen reader
+$('estop').addEventListener('click', (event) => { if (event.detail === 0) stop() }) // from the keyboard or a screen reader
 for (const what of ['release', 'enable', 'take', 'cancel']) $(what).addEventListener('click', () => request(what))
 for (const [slider, percent] of [['speed-share', 'percent'], ['jog-share', 'jog-percent']]) {
   $(slider).addEventListener('input', () => setText($(percent), `${$(slider).value} %`))
@@ -286,4 +286,4 @@ tabs.forEach((tab) => {
   })
 })
 setInterval(showTables, 1000)
-setInterval(showSettings, 2000) // others may change them too
+setInterval(showSettings, 2000) // other clients may change them too

@@ -1,7 +1,7 @@
-// The map with the robot, its path and its goal. It is drawn again when something has changed.
+// The map with the robot, its path and its goal. It is redrawn after each change.
 import { ON_ROBOT } from './layers.js'
 
-const TRACE_CELL_M = 0.05, TRACE_CELLS = 1200 // of the trace of scans, which is shown where there is no map
+const TRACE_CELL_M = 0.05, TRACE_CELLS = 1200 // of the grid of past scans, which is shown without a map
 const MIN_HEADING_DRAG_M = 0.1 // a shorter drag sets no heading
 const MIN_STEP_M = 0.03 // between two points of the driven path
 const MAX_TRAIL = 4000, TRAIL_CUT = 1000 // points of the driven path
@@ -14,15 +14,15 @@ export class MapView {
   #drag = null
   #drawScheduled = false
   #pointers = new Map()
-  #boot = null // which start of the driver the odometry is of
+  #boot = null // the driver's start that the odometry belongs to
 
   constructor(canvas, onGoal) {
     this.canvas = canvas
     this.onGoal = onGoal
-    this.layers = [] // functions that draw more, in metres
-    this.robotLayers = [] // likewise, in the robot's frame
-    this.tool = null // takes a click instead of the goal
-    this.pick = null // takes a click on something that is drawn; returns whether there is anything
+    this.layers = [] // functions that draw more, in the frame of the map [m]
+    this.robotLayers = [] // the same, in the robot's frame
+    this.tool = null // a function that receives clicks and drags instead of `onGoal`
+    this.pick = null // a function that receives clicks first; returns true if it used one
     this.follow = true
     this.dragMoves = false // a drag moves the map and sets no goal
     this.robot = null
@@ -117,7 +117,7 @@ export class MapView {
     this.picture = new OffscreenCanvas(width, height)
     const pen = this.picture.getContext('2d'), image = pen.createImageData(width, height)
     const dark = this.colour.floor < '#8'
-    const bytes = new Uint8ClampedArray(4 * 256) // of each value of a cell; unknown ones have no colour
+    const bytes = new Uint8ClampedArray(4 * 256) // RGBA of each cell value; unknown cells are transparent
     for (let cell = 0; cell <= 100; cell++) {
       const grey = dark ? 30 + cell * 2 : 255 - cell * 2.4
       bytes.set([grey, grey, grey, 255], 4 * cell)
@@ -212,7 +212,7 @@ export class MapView {
     pen.stroke()
   }
 
-  /** Write a text, upright on the screen; `yaw` is that of the frame which is drawn in. */
+  /** Write a text upright on the screen; `yaw` is the rotation of the current frame. */
   label(pen, text, x, y, yaw = 0) {
     pen.save()
     pen.translate(x, y)

@@ -1,15 +1,16 @@
-// What cameras and perceptors found, on the map: contours, things, tags. A click on a thing offers to go there.
+// Findings of cameras and perceptors on the map: contours, things, tags. A click on a thing offers to go there.
 import { paintDisc, toFrameOf } from './layers.js'
 import { $, fillTable, makeElement, setText } from './panels.js'
 
 const TAU = 2 * Math.PI
-const HIT_PX = 14 // how near a click must be to a thing
-const OVERHANG_M = 0.1, HOLE_M = -0.01 // as recordings draw them
-const FADE_S = 10, MIN_ALPHA = 0.15 // a contour fades from the time on when it was last seen
-const PERCEIVED_FOR_MS = 1000
+const MAX_HIT_PX = 14 // from a thing to a click on it
+const OVERHANG_M = 0.1, HOLE_M = -0.01 // the same limits as in recordings
+const FADE_S = 10, MIN_ALPHA = 0.15 // a contour fades after it was last seen
+const PERCEIVED_SHOWN_MS = 1000
 const STANDOFF_M = 0.3 // between the robot's outline and a thing that it drives to
-const DIRECTIONS = 24, MAX_FREE = 50 // [%] of a map's cell that is occupied
-const LAYERS = ['contours', 'objects', 'perceived'] // that can be switched in the legend
+const DIRECTIONS = 24 // to try around a thing
+const OCCUPIED_PERCENT = 50 // least value of an occupied cell
+const LAYERS = ['contours', 'objects', 'perceived'] // with a switch in the legend
 
 const kindOf = ({ bottom }) => (bottom < HOLE_M ? 'hole' : bottom > OVERHANG_M ? 'overhang' : 'low')
 const isTag = (thing) => thing.label === undefined
@@ -22,13 +23,13 @@ function isFree(map, x, y, reach) {
     for (let dx = -cells; dx <= cells; dx++) {
       if (Math.hypot(dx, dy) > cells) continue
       const [c, r] = [column + dx, row + dy], cell = map.cells[r * map.width + c]
-      if (c < 0 || r < 0 || c >= map.width || r >= map.height || cell < 0 || cell >= MAX_FREE) return false
+      if (c < 0 || r < 0 || c >= map.width || r >= map.height || cell < 0 || cell >= OCCUPIED_PERCENT) return false
     }
   }
   return true
 }
 
-/** Return the place before a thing that is nearest to the robot and free, facing the thing; null if there is none. */
+/** Return the free pose in front of a thing, facing it, that is nearest to the robot; null if there is none. */
 export function placeBefore(thing, robot, map, reach) {
   const away = thing.size[0] / 2 + reach + STANDOFF_M, towards = Math.atan2(robot.y - thing.y, robot.x - thing.x)
   for (let i = 0; i < DIRECTIONS; i++) {
@@ -45,7 +46,7 @@ export class Objects {
   #perceived = new Map() // by perceptor: objects and their arrival in ms
   #shown = Object.fromEntries(LAYERS.map((layer) => [layer, true]))
 
-  /** `go(goal, place)` sends a goal; `allowed()` says whether this viewer may. */
+  /** `go(goal, place)` sends a goal; `allowed()` returns whether this viewer may. */
   constructor(map, { go, allowed }) {
     Object.assign(this, { map, go, allowed, things: [] })
     map.layers.push((pen) => this.#paintThings(pen))
@@ -83,15 +84,15 @@ export class Objects {
     this.map.draw()
   }
 
-  /** Show the switch of a layer once there has been something to see. */
-  #reveal(layer, any) { if (any) $(`show-${layer}`).hidden = false }
+  /** Show the switch of a layer from its first content on. */
+  #reveal(layer, hasContent) { if (hasContent) $(`show-${layer}`).hidden = false }
 
   #inMap() { return this.map.robot?.frame === 'map' }
 
   #pick(x, y) {
     if (!this.#shown.objects || !this.#inMap()) return false
     const off = (thing) => Math.hypot(thing.x - x, thing.y - y)
-    const near = this.things.filter((thing) => off(thing) < Math.max(HIT_PX * this.map.pixel, thing.size[0] / 2))
+    const near = this.things.filter((thing) => off(thing) < Math.max(MAX_HIT_PX * this.map.pixel, thing.size[0] / 2))
     const [picked] = near.sort((one, other) => off(one) - off(other))
     this.#offer(picked ?? null)
     return Boolean(picked)
@@ -116,7 +117,7 @@ export class Objects {
     const alone = !isTag(thing) && this.things.filter((other) => other.label === thing.label).length === 1
     const round = (value) => Math.round(value * 1000) / 1000
     if (isTag(thing)) this.go({ tag: thing.id }, place)
-    else if (alone || !place) this.go({ object: thing.label }, place) // decision looks for a place before it
+    else if (alone || !place) this.go({ object: thing.label }, place) // decision finds a pose in front of it
     else this.go({ x: round(place.x), y: round(place.y), yaw: round(place.yaw) }, place)
   }
 
@@ -152,13 +153,13 @@ export class Objects {
     pen.globalAlpha = 1
   }
 
-  /** Paint what perceptors find, which is in the odometry frame, as obstacles are. */
+  /** Paint the findings of perceptors, which are in the odometry frame like obstacles. */
   #paintPerceived(pen) {
     const { state } = this.map.robot
     if (!state || !this.#shown.perceived) return
     const toRobot = toFrameOf(state.pose), rotate = toFrameOf({ x: 0, y: 0, yaw: state.pose.yaw })
     for (const [objects, arrivedMs] of this.#perceived.values()) {
-      if (performance.now() - arrivedMs > PERCEIVED_FOR_MS) continue
+      if (performance.now() - arrivedMs > PERCEIVED_SHOWN_MS) continue
       for (const one of objects) {
         const [x, y] = toRobot([one.x, one.y])
         paintDisc(pen, this.map, x, y, one.radius, rotate([one.velocity_x, one.velocity_y]))
@@ -188,7 +189,7 @@ export class Objects {
     map.stroke(pen, map.colour.ink, thing === this.#offered ? 3 : 1)
   }
 
-  /** Paint a square, and a line where the tag's face looks. */
+  /** Paint a square, and a line in the direction of the tag's face. */
   #paintTag(pen, tag) {
     const { map } = this, side = Math.max(tag.size[0], 9 * map.pixel)
     pen.save()

@@ -122,7 +122,7 @@ function problemsOfProcesses() {
   return [...healthByProcess.values()].flatMap(([health]) => health.problems ?? [])
 }
 
-/** Return the cameras that processes say they publish pictures of. */
+/** Return the cameras whose pictures are published, according to the health of processes. */
 export function publishedCameras() {
   const keys = [...healthByProcess.values()].flatMap(([health]) => Object.keys(health.sent_hz))
   return keys.filter((key) => key.startsWith(IMAGE)).map((key) => key.slice(IMAGE.length))

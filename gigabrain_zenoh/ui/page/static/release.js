@@ -1,8 +1,8 @@
-// Counts what is held as released where a browser may not report its release.
+// Releases held keys and buttons when a browser may not report their release.
 const PERIOD_MS = 40
 const MAX_STALL_MS = 1000
 
-/** Call `release` when the window loses the focus or is hidden, and after the page has been held up, as by a dialog. */
+/** Call `release` when the window loses the focus or is hidden, and after the page was suspended, for example by a dialog. */
 export function onLostRelease(release) {
   addEventListener('blur', release)
   document.addEventListener('visibilitychange', release)

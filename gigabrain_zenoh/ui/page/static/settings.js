@@ -1,4 +1,4 @@
-// The table of settings: parameters of the running processes, changed one at a time, and saved to a file.
+// The table of settings: parameters of the running processes, to change one by one and to save in a file.
 import { $, setText } from './panels.js'
 
 export class Settings {
@@ -10,17 +10,17 @@ export class Settings {
     this.shown = [] // as the robot sent them
   }
 
-  /** Ask for all settings; a value that is being typed stays. */
+  /** Request all settings; keep a value that a person is typing. */
   async refresh() {
     const reply = await this.request('settings')
-    if (!reply.ok) return this.#say(reply)
+    if (!reply.ok) return this.#showReply(reply)
     this.shown = reply.settings
     const known = new Set(this.shown.map(({ process, param }) => `${process} ${param.name}`))
     for (const [key, row] of this.#rows) {
       if (!known.has(key) && !row.contains(document.activeElement)) { row.remove(); this.#rows.delete(key) }
     }
     for (const setting of this.shown) this.#fill(setting)
-    this.#offer()
+    this.#offerFile()
   }
 
   #fill({ process, param }) {
@@ -46,18 +46,18 @@ export class Settings {
 
   async #set(process, name, input) {
     const reply = await this.request('set', { process, name, value: input.value.trim() })
-    this.#say(reply)
+    this.#showReply(reply)
     input.blur()
     await this.refresh()
   }
 
-  #say(reply) {
+  #showReply(reply) {
     setText($('setting-reply'), reply.text)
     $('setting-reply').className = `note${reply.ok ? '' : ' bad'}`
   }
 
   /** Offer the changed settings as a file; JSON is YAML. */
-  #offer() {
+  #offerFile() {
     const file = {}
     for (const { param } of this.shown) {
       if (param.value === param.initial) continue

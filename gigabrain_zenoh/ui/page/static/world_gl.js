@@ -2,8 +2,8 @@
 const TAU = 2 * Math.PI
 const [PLANE, BOX, CYLINDER, SPHERE, CAPSULE, ELLIPSOID, MESH] = [0, 1, 2, 3, 4, 5, 6]
 const SIDES = 20, RINGS = 8 // of round shapes
-const FLOOR_M = 60 // half of what is drawn of an endless floor
-const FLOATS = 7 // of a vertex: position, normal, colour in one
+const FLOOR_M = 60 // half the drawn side of an endless floor
+const FLOATS = 7 // of a vertex: position, normal, and all of its colour in one
 const SOLID = 126 // alpha of all but the floor; with a higher one a colour could be NaN
 
 const VERTEX = `
@@ -61,7 +61,7 @@ const unit = (a) => { const length = Math.hypot(...a) || 1; return [a[0] / lengt
 export class Camera {
   target = [0, 0, 0]
   distance = 6
-  azimuth = -2.2 // [rad], from where it looks
+  azimuth = -2.2 // [rad], from the target to the camera
   elevation = 0.95
 
   get eye() {
@@ -95,7 +95,7 @@ export class Camera {
   }
 }
 
-/** Return a colour as four bytes in the place of a float; alpha 0 stands for the floor. */
+/** Return the four bytes of a colour as a float; alpha 0 stands for the floor. */
 function packed([r, g, b], alpha = SOLID) {
   return new Float32Array(new Uint8Array([r, g, b, alpha]).buffer)[0]
 }
@@ -104,7 +104,7 @@ function packed([r, g, b], alpha = SOLID) {
 class Triangles {
   constructor() { this.values = [] }
 
-  /** Add a shape with a function that turns its points and normals. */
+  /** Add the points and normals of a shape, moved to its place. */
   add(points, normals, place, colour) {
     const [a, b, c] = rotation(place.slice(3))
     const turn = (p) => [0, 1, 2].map((i) => a[i] * p[0] + b[i] * p[1] + c[i] * p[2])
@@ -115,7 +115,7 @@ class Triangles {
   }
 }
 
-/** Return points and normals of a grid of four-cornered patches, made by a function of u and v. */
+/** Return points and normals of a grid of four-cornered patches, by functions of u and v. */
 function patches(across, along, point, normal) {
   const points = [], normals = []
   for (let i = 0; i < across; i++) for (let j = 0; j < along; j++) {
@@ -188,10 +188,10 @@ function shape(kind, size, meshes) {
 }
 
 export class Renderer {
-  #bodies = [] // of each its buffer and its count of vertices
-  #marks = null // the same, of what is drawn in the frame of a body
+  #bodies = [] // the buffer and the number of vertices of each
+  #marks = null // the same for boxes that are drawn in the frame of a body
 
-  /** Throws where there is no WebGL. */
+  /** Throws an error if the browser has no WebGL. */
   constructor(canvas) {
     const gl = canvas.getContext('webgl', { antialias: true })
     if (!gl) throw new Error('this browser has no WebGL')
@@ -211,7 +211,7 @@ export class Renderer {
     for (const place of Object.values(this.at)) gl.enableVertexAttribArray(place)
   }
 
-  /** Take the shapes of a scene. */
+  /** Load the shapes of a scene. */
   load({ bodies, kinds, owners, sizes, places, colours, meshes }) {
     const gl = this.gl, parts = bodies.map(() => new Triangles())
     kinds.forEach((kind, i) => {
@@ -223,7 +223,7 @@ export class Renderer {
     this.#bodies = parts.map((part) => this.#stored(part))
   }
 
-  /** Mark places in the frame of a body by boxes: each half a size, a pose and a colour from 0 to 255. */
+  /** Set the boxes to draw in the frame of a body: half its size, its pose, and its colour from 0 to 255. */
   mark(boxes) {
     const triangles = new Triangles()
     for (const { size, pose, colour } of boxes) triangles.add(...box(size), pose, packed(colour))
@@ -238,7 +238,7 @@ export class Renderer {
     return { buffer, count: values.length / FLOATS }
   }
 
-  /** Draw all bodies where `matrices` has them, and the marks at the body with this number; the first body stands still. */
+  /** Draw all bodies with their `matrices`, and the marks in the frame of body number `marked`. */
   draw(camera, matrices, background, marked) {
     const gl = this.gl, { width, height } = gl.canvas
     gl.viewport(0, 0, width, height)

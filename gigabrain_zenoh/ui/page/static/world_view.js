@@ -2,13 +2,13 @@
 import { planMarks } from './arm_plan.js'
 import { Camera, matrixOf, Renderer } from './world_gl.js'
 
-const STILL = [0, 0, 0, 1, 0, 0, 0]
-const CLICK_PIXELS = 5 // a longer drag is no click
-const MIN_WALK_M = 0.3 // a shorter drag makes a person that stands
-const REACH_M = 0.4 // from a thing's middle, within which a click is on it
+const ORIGIN_POSE = [0, 0, 0, 1, 0, 0, 0]
+const MAX_CLICK_PX = 5 // a longer drag is no click
+const MIN_WALK_M = 0.3 // a shorter drag adds a person that stands
+const MIN_HIT_RADIUS_M = 0.4 // from a thing's middle to a click on it
 const SIZES = { box: [0.3, 0.3, 0.5], cylinder: [0.3, 0.3, 0.5] }
 const CLOSE_ELEVATION = 0.5 // [rad]
-const CLOSE_HEIGHT_M = 0.12 // of what is looked at
+const CLOSE_HEIGHT_M = 0.12 // of the camera's target
 const ROBOT = 'robot/', BASE = 'robot/base'
 
 const bytesOf = (base64) => Uint8Array.from(atob(base64), (letter) => letter.charCodeAt(0))
@@ -60,11 +60,11 @@ export class WorldView {
       places: floatsOf(scene.places), colours: bytesOf(scene.colours),
       meshes: scene.meshes.map((one) => ({ vertices: floatsOf(one.vertices), faces: new Uint32Array(bytesOf(one.faces).buffer) })),
     }
-    this.#matrices = [matrixOf(STILL)]
+    this.#matrices = [matrixOf(ORIGIN_POSE)]
     if (this.shown) this.#load()
   }
 
-  /** Show where the arm's tool will go, and the grasps that were found. */
+  /** Show the planned path of the arm's tool, and the grasps. */
   setPlan(plan) {
     this.#marks = planMarks(plan)
     this.#renderer?.mark(this.#marks)
@@ -117,10 +117,10 @@ export class WorldView {
   #floorAt(event) {
     const area = this.canvas.getBoundingClientRect()
     const x = (2 * (event.clientX - area.left)) / area.width - 1, y = 1 - (2 * (event.clientY - area.top)) / area.height
-    const way = this.#camera.ray(x, y, area.width / area.height), eye = this.#camera.eye
-    if (way[2] > -0.01) return null
-    const far = -eye[2] / way[2]
-    return [eye[0] + far * way[0], eye[1] + far * way[1]]
+    const ray = this.#camera.ray(x, y, area.width / area.height), eye = this.#camera.eye
+    if (ray[2] > -0.01) return null
+    const distance = -eye[2] / ray[2]
+    return [eye[0] + distance * ray[0], eye[1] + distance * ray[1]]
   }
 
   #listen() {
@@ -171,7 +171,7 @@ export class WorldView {
     const drag = this.#drag
     this.#drag = null
     if (!drag?.place || !drag.tool || drag.tool === 'none') return
-    const to = this.#floorAt(event), moved = Math.hypot(event.clientX - drag.from[0], event.clientY - drag.from[1]) > CLICK_PIXELS
+    const to = this.#floorAt(event), moved = Math.hypot(event.clientX - drag.from[0], event.clientY - drag.from[1]) > MAX_CLICK_PX
     if (drag.tool === 'remove') this.#remove(drag.place)
     else if (drag.tool === 'person') this.#add('person', drag.place, moved ? to : null)
     else this.#add(drag.tool, drag.place, null)
@@ -179,20 +179,20 @@ export class WorldView {
 
   #add(kind, [x, y], to) {
     const walks = to && Math.hypot(to[0] - x, to[1] - y) > MIN_WALK_M
-    this.#ask({ do: 'add', thing: { kind, x, y, ...(SIZES[kind] && { size: SIZES[kind] }), ...(walks && { path: [to] }) } })
+    this.#request({ do: 'add', thing: { kind, x, y, ...(SIZES[kind] && { size: SIZES[kind] }), ...(walks && { path: [to] }) } })
   }
 
   #remove([x, y]) {
-    const away = this.scene.things.map(({ name, kind, size }) => {
+    const near = this.scene.things.map(({ name, kind, size }) => {
       const { 12: at_x, 13: at_y } = this.#matrices[this.scene.bodies.indexOf(name)] ?? { 12: Infinity, 13: Infinity }
-      const reach = kind === 'person' ? REACH_M : Math.max(REACH_M, Math.hypot(size[0], size[1]) / 2)
+      const reach = kind === 'person' ? MIN_HIT_RADIUS_M : Math.max(MIN_HIT_RADIUS_M, Math.hypot(size[0], size[1]) / 2)
       return { name, distance: Math.hypot(at_x - x, at_y - y), reach }
     }).filter(({ distance, reach }) => distance <= reach).sort((a, b) => a.distance - b.distance)
-    if (away.length) this.#ask({ do: 'remove', name: away[0].name })
+    if (near.length) this.#request({ do: 'remove', name: near[0].name })
     else this.say('nothing that was put in by hand is there', false)
   }
 
-  async #ask(request) {
+  async #request(request) {
     const reply = await this.change(request)
     this.say(reply.text, reply.ok)
   }

@@ -1,11 +1,11 @@
-// Zones and named places on the map: drawn, added and removed by hand; and the saved maps.
+// Zones and named places on the map, which a person adds and removes; and the saved maps.
 import { $, setText } from './panels.js'
 
 const TAU = 2 * Math.PI
-const HIT_PX = 14 // how near a click must be to a place or a lane
+const MAX_HIT_PX = 14 // from a place or a lane to a click on it
 const MIN_POINTS = { keepout: 3, speed: 3, one_way: 2 }
 const COLOUR = { keepout: 'scan', speed: 'zone', one_way: 'plan' }
-const ROUND = 1000 // to millimetres
+const STEPS_PER_M = 1000 // coordinates are rounded to millimetres
 const HINTS = {
   keepout: 'Click the corners of the zone, then Finish.',
   speed: 'Click the corners of the zone, then Finish.',
@@ -20,14 +20,14 @@ const contains = (points, x, y) => points.reduce((inside, [ax, ay], i) => {
   return (ay > y) !== (by > y) && x < ax + ((y - ay) / (by - ay)) * (bx - ax) ? !inside : inside
 }, false)
 
-/** Return the distance of a point to a line through points. */
+/** Return the distance from a point to a polyline. */
 const distance = (points, x, y) => Math.min(...points.slice(1).map(([bx, by], i) => {
   const [ax, ay] = points[i], dx = bx - ax, dy = by - ay
   const share = Math.min(1, Math.max(0, ((x - ax) * dx + (y - ay) * dy) / (dx * dx + dy * dy || 1)))
   return Math.hypot(x - ax - share * dx, y - ay - share * dy)
 }))
 
-const rounded = (value) => Math.round(value * ROUND) / ROUND
+const rounded = (value) => Math.round(value * STEPS_PER_M) / STEPS_PER_M
 
 export class Zones {
   #points = [] // of the zone that is being drawn
@@ -107,7 +107,7 @@ export class Zones {
   }
 
   async #remove(x, y) {
-    const near = HIT_PX * this.map.pixel
+    const near = MAX_HIT_PX * this.map.pixel
     const place = this.places.find((one) => Math.hypot(one.x - x, one.y - y) < near)
     const zone = this.zones.findLast((one) => (one.kind === 'one_way' ? distance(one.points, x, y) < Math.max(near, one.lane_width / 2) : contains(one.points, x, y)))
     const found = place ?? zone
