@@ -1,8 +1,8 @@
 """Access to the bridge: viewers that may connect, and the secret topic for steering.
 
 The server's library checks no Origin, so a page of any site in a browser of this machine could
-connect. It also stores everything that a viewer does not read. It therefore listens on a random
-port of a random loopback address (Linux; elsewhere of 127.0.0.1), and `Front` forwards the bytes of
+connect. It also stores all data that a viewer does not read. So the server listens on a random port
+of a random loopback address (on Linux; elsewhere of 127.0.0.1). `Front` forwards the bytes of
 viewers that may connect.
 """
 
@@ -26,16 +26,16 @@ from gigabrain_zenoh.security.identity_files import made_once
 log = logging.getLogger(__name__)
 
 HOST = "127.0.0.1"
-# pages of this machine, and the known viewers; desktop programs are pages of a file
+# origins of this machine's pages, and of known viewers; desktop programs send file://
 OWN_PAGE = re.compile(r"https?://(localhost|127(\.\d{1,3}){3}|\[::1\])(:\d{1,5})?")
 VIEWERS = ("https://app.foxglove.dev", "https://studio.foxglove.dev", "file://")
 MAX_VIEWERS = 16
-MAX_ARRIVING = 64  # connections without a request; the oldest gives way to the newest
+MAX_ARRIVING = 64  # connections without a request; a new one replaces the oldest
 MAX_HEAD_BYTES = 16 * 1024
 REQUEST_TIMEOUT_S = 5.0
 STALL_TIMEOUT_S = 5.0  # a viewer that reads nothing for so long is disconnected
 MAX_LOGGED_REASONS = 20  # each is logged once
-TRIM_DELAY_S = 1.0  # until the server has noticed that a viewer has left
+TRIM_DELAY_S = 1.0  # time for the server to notice that a viewer left
 SECRET_BYTES = 24
 TOPIC_PLACEHOLDER = "TOPIC_TO_STEER"  # in layout.json
 CHUNK_BYTES = 64 * 1024
@@ -89,7 +89,7 @@ class Front:
             if head := await self._admit(reader, writer):
                 await self._forward(head, reader, writer)
         except (OSError, TimeoutError, asyncio.IncompleteReadError, asyncio.LimitOverrunError):
-            pass  # gone, silent, slow, or not HTTP: no answer is expected
+            pass  # disconnected, silent, slow, or not HTTP: no answer is expected
         except asyncio.CancelledError:
             pass  # by `close`; the streams of Python 3.11 would log it
         finally:
@@ -99,7 +99,7 @@ class Front:
     async def _admit(
         self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter
     ) -> bytes | None:
-        """Return the request of a viewer that may connect; answer others."""
+        """Return the request of a viewer that may connect; refuse others, and return None."""
         self._arriving.append(writer)
         if len(self._arriving) > MAX_ARRIVING:
             self._arriving.pop(0).transport.abort()
@@ -126,7 +126,7 @@ class Front:
         return None
 
     def refusal(self, head: bytes) -> str:
-        """Return why a request is refused, as an HTTP status; an empty text if it is admitted."""
+        """Return the HTTP status that refuses a request; an empty text if it is admitted."""
         lines = head.decode("latin-1").split("\r\n")[1:]
         fields = [(name.strip().lower(), value.strip().lower())
                   for name, _, value in (line.partition(":") for line in lines)]  # fmt: skip
@@ -173,7 +173,7 @@ async def _copy(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> N
 def topic_to_steer(config: FoxgloveConfig) -> str:
     """Return the topic on which a viewer may publish velocities. Raises ConfigError.
 
-    Its secret serves nothing else: layouts are shared, and the page's tokens allow more.
+    The secret has no other use: people share layouts, and the page's tokens allow more.
     """
     path = Path(config.secret) if config.secret else state_dir() / "foxglove" / "secret"
     secret, _ = made_once(path, secrets.token_urlsafe(SECRET_BYTES).encode())

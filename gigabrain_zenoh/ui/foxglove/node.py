@@ -62,11 +62,11 @@ MAX_WAITING_MESSAGES = 64  # for a slow viewer; the oldest are dropped
 NAME = "gigabrain"
 MAX_MESSAGE_BYTES = 1024
 MAX_CHANNELS = 64  # of all viewers
-FED = (IMAGE, DEPTH, PERCEIVED, DETECTIONS)
+FEED_TOPICS = (IMAGE, DEPTH, PERCEIVED, DETECTIONS)
 
 
 def _key(topic: Topic[Any], name: str) -> str:
-    """Return the key of what is drawn; detections have one for each camera too."""
+    """Return the key of a drawn message; detections have one for each camera as well."""
     return f"{topic.key}/{name}" if name else topic.key
 
 
@@ -77,20 +77,20 @@ class FoxgloveView(ViewerScene):
         self._context, self._drawer = context, Drawer()
         self._kept: dict[str, tuple[Topic[Any], Message, str]] = {}  # by key
         self._channels: dict[str, Channel] = {}
-        self._channel_names: dict[str, set[str]] = {}  # by the key that they are drawn from
+        self._channel_names: dict[str, set[str]] = {}  # by the key of the drawn message
         super().__init__(bus)
-        self._feed = CameraFeed(bus, *FED)
+        self._feed = CameraFeed(bus, *FEED_TOPICS)
         bus.subscribe(CAMERA, lambda key, info: self._keep(CAMERA, info, key.rpartition("/")[2]))
         bus.latest(OBJECT_MAP, lambda stored: self._keep(OBJECT_MAP, stored))
         bus.latest(ARM_MODEL, self._on_arm_model)
 
     def draw_new(self, viewers: int) -> None:
-        """Draw everything received since the last call; pictures are received for viewers only."""
+        """Draw the messages since the last call; receive pictures only while there are viewers."""
         for topic, sampled in self.sampled.items():
             if self._has_viewers(topic.key) and (message := sampled.poll()):
                 self._draw(topic, message)
         self._feed.watch(viewers > 0)
-        for topic in FED:
+        for topic in FEED_TOPICS:
             for name in self._feed.names(topic):
                 if self._has_viewers(_key(topic, name)) and (new := self._feed.poll(topic, name)):
                     self._draw(topic, new, name)
@@ -111,7 +111,7 @@ class FoxgloveView(ViewerScene):
             self._keep(topic, message)
 
     def _on_arm_model(self, model: ArmModel) -> None:
-        """Draw the arm, and states once more without a viewer: there are more channels now."""
+        """Draw the arm, and states once even without viewers: the arm adds channels to them."""
         for topic in (ARM_MODEL, STATE):
             self._channel_names.pop(topic.key, None)
         self._keep(ARM_MODEL, model)
@@ -121,7 +121,7 @@ class FoxgloveView(ViewerScene):
         self._draw(topic, message, name)
 
     def _has_viewers(self, key: str) -> bool:
-        """Return whether a viewer subscribes, or cannot yet because nothing has been drawn."""
+        """Return whether a viewer subscribes, or no channel exists yet to subscribe to."""
         names: Iterable[str] = self._channel_names.get(key, ())
         return not names or any(self._channels[name].base.has_sinks() for name in names)
 
@@ -165,14 +165,14 @@ class _Vector(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class _Twist(Struct, frozen=True, forbid_unknown_fields=True):
-    """Twist of ROS, as the Teleop panel sends it."""
+    """A ROS Twist, as the Teleop panel sends it."""
 
     linear: _Vector
     angular: _Vector
 
 
 def velocity_of(data: bytes) -> Velocity:
-    """Decode a velocity in JSON: a Twist of ROS, or a Velocity. Raises ValueError."""
+    """Decode a velocity in JSON: a ROS Twist, or a Velocity. Raises ValueError."""
     try:
         if b'"linear"' not in data:
             return msgspec.json.decode(data, type=Velocity)
@@ -185,7 +185,7 @@ def velocity_of(data: bytes) -> Velocity:
 
 
 class FoxgloveSteering(ServerListener):
-    """Receives from viewers in the server's threads, and acts in the event loop."""
+    """Receives commands in the server's threads, and carries them out in the event loop."""
 
     def __init__(self, view: FoxgloveView, topic: str) -> None:
         self._view, self._arbiter, self._topic = view, TeleopArbiter(view), topic
@@ -199,8 +199,8 @@ class FoxgloveSteering(ServerListener):
         )
 
     def may_steer(self, viewer: int) -> bool:
-        """Return whether a viewer publishes on the secret topic. In any thread."""
-        return any(viewer == known for known, _ in tuple(self._channels))
+        """Return whether a viewer publishes on the secret topic. Called in any thread."""
+        return any(viewer == steering for steering, _ in tuple(self._channels))
 
     def close(self) -> None:
         """End steering."""
@@ -221,7 +221,7 @@ class FoxgloveSteering(ServerListener):
     def on_get_parameters(
         self, client: Client, param_names: list[str], request_id: str | None = None
     ) -> list[Parameter]:
-        """Return parameters by name; all without names."""
+        """Return the parameters with these names; all if there are none."""
         return self.requests.get(param_names)
 
     def on_set_parameters(
@@ -235,16 +235,16 @@ class FoxgloveSteering(ServerListener):
         self.parameters_wanted = True
 
     def on_parameters_unsubscribe(self, param_names: list[str]) -> None:
-        """Go on to publish changes: others may be subscribed to more."""
+        """Do nothing: other viewers may still subscribe to changes."""
 
     def on_client_advertise(self, client: Client, channel: ClientChannel) -> None:
         """Admit a viewer that advertises the secret topic."""
-        may = channel.topic == self._topic and channel.encoding == "json"
-        self._in_loop(self._open, client.id, channel.id, may)
+        allowed = channel.topic == self._topic and channel.encoding == "json"
+        self._in_loop(self._open_channel, client.id, channel.id, allowed)
 
     def on_client_unadvertise(self, client: Client, client_channel_id: int) -> None:
-        """Forget a viewer that has left or publishes no longer."""
-        self._in_loop(self._close, client.id, client_channel_id)
+        """Forget a viewer that left or stopped publishing."""
+        self._in_loop(self._close_channel, client.id, client_channel_id)
 
     def on_message_data(self, client: Client, client_channel_id: int, data: bytes) -> None:
         """Process a message from a viewer."""
@@ -257,13 +257,13 @@ class FoxgloveSteering(ServerListener):
         if not self._loop.is_closed():
             self._loop.call_soon_threadsafe(act, *arguments)
 
-    def _open(self, viewer: int, channel: int, may: bool) -> None:
-        if may and len(self._channels) < MAX_CHANNELS:
+    def _open_channel(self, viewer: int, channel: int, allowed: bool) -> None:
+        if allowed and len(self._channels) < MAX_CHANNELS:
             self._channels.add((viewer, channel))
         else:
             self._refuse(viewer, "it does not publish on the topic of the layout file")
 
-    def _close(self, viewer: int, channel: int) -> None:
+    def _close_channel(self, viewer: int, channel: int) -> None:
         if (viewer, channel) in self._channels:
             self._channels.discard((viewer, channel))
             self._refused.discard(viewer)

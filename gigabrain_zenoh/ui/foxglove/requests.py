@@ -31,11 +31,14 @@ from gigabrain_zenoh.gate.state import BRAIN
 log = logging.getLogger(__name__)
 
 T = TypeVar("T")
-PATIENCE_S = GIVE_UP_S + 1.0  # of a server's thread for the event loop
+LOOP_TIMEOUT_S = GIVE_UP_S + 1.0  # a server's thread waits so long for the event loop
 REFRESH_NS = 2_000_000_000
-MAX_SET = 32  # parameters of one request
-REPLY = {"type": "object", "properties": {"ok": {"type": "boolean"}, "text": {"type": "string"}}}
-STRANGER = "it does not publish on the topic of the layout file"
+MAX_PARAMETERS = 32  # that one request may set
+REPLY_SCHEMA = {
+    "type": "object",
+    "properties": {"ok": {"type": "boolean"}, "text": {"type": "string"}},
+}
+NOT_PERMITTED = "it does not publish on the topic of the layout file"
 
 
 class FoxgloveRequests:
@@ -51,7 +54,7 @@ class FoxgloveRequests:
         self._bus, self._state, self._may = bus, state, may
         self._params = ParamTable(bus, processes)
         self._loop = asyncio.get_running_loop()
-        self._known: dict[str, tuple[str, Param]] = {}  # by a viewer's name: process, parameter
+        self._known: dict[str, tuple[str, Param]] = {}  # process and parameter, by viewers' names
 
     def services(self) -> list[Service]:
         """Return the services that viewers may call."""
@@ -61,40 +64,42 @@ class FoxgloveRequests:
     async def refresh(self) -> list[Parameter]:
         """Ask all processes for their parameters; return those that have changed."""
         table = await self._params.read()
-        found = {f"{name}.{one.name}": (name, one) for name, some in table.items() for one in some}
-        changed = [name for name, one in found.items() if self._known.get(name) != one]
-        self._known = found
+        new = {f"{name}.{one.name}": (name, one) for name, some in table.items() for one in some}
+        changed = [name for name, entry in new.items() if self._known.get(name) != entry]
+        self._known = new
         return self.shown(changed)
 
     def get(self, names: list[str]) -> list[Parameter]:
-        """Return parameters as they are now; all without names. In a server's thread."""
-        with contextlib.suppress(Refused):  # the robot is busy: as they were
+        """Return present parameters; all without names. Called in a server's thread."""
+        with contextlib.suppress(Refused):  # the robot is busy: return the last values
             self._in_loop(self.refresh())
         return self.shown(names)
 
     def shown(self, names: Iterable[str]) -> list[Parameter]:
-        """Return parameters as viewers take them; all without names."""
+        """Return known parameters in the viewers' format; all without names."""
         known = self._known
         chosen = [name for name in names if name in known] or ([] if names else list(known))
-        return [Parameter(name, value=_typed(known[name][1].value)) for name in chosen]
+        return [Parameter(name, value=_number_or_text(known[name][1].value)) for name in chosen]
 
     def set(self, viewer: int, wanted: list[Parameter]) -> list[Parameter]:
-        """Set parameters; return all of them as they are then. In a server's thread."""
+        """Set parameters, and return their new values. Called in a server's thread."""
         if self._may(viewer):
-            self._in_loop(self._set_all(wanted[:MAX_SET]))
+            self._in_loop(self._set_all(wanted[:MAX_PARAMETERS]))
         else:
-            log.warning("viewer %d may not set parameters: %s", viewer, STRANGER)
+            log.warning("viewer %d may not set parameters: %s", viewer, NOT_PERMITTED)
         return self.shown([one.name for one in wanted])
 
     async def _set_all(self, wanted: list[Parameter]) -> None:
-        for one in wanted:
-            process, name = one.name.partition(".")[::2]
+        for parameter in wanted:
+            process, name = parameter.name.partition(".")[::2]
             try:
-                if one.name not in self._known:
-                    raise unknown("parameter", one.name[:100], self._known)
-                log.info("%s", await set_param(self._bus, process, name, _text(one.get_value())))
+                if parameter.name not in self._known:
+                    raise unknown("parameter", parameter.name[:100], self._known)
+                log.info(
+                    "%s", await set_param(self._bus, process, name, _text(parameter.get_value()))
+                )
             except GigabrainError as error:
-                log.warning("parameter %s: %s", one.name[:100], error)
+                log.warning("parameter %s: %s", parameter.name[:100], error)
         await self.refresh()
 
     def _service(self, name: str, act: Callable[[], Coroutine[Any, Any, str]]) -> Service:
@@ -102,17 +107,17 @@ class FoxgloveRequests:
             name=f"{name[1:]}_request", encoding="jsonschema", data=b'{"type": "object"}'
         )
         reply = Schema(
-            name=f"{name[1:]}_reply", encoding="jsonschema", data=msgspec.json.encode(REPLY)
+            name=f"{name[1:]}_reply", encoding="jsonschema", data=msgspec.json.encode(REPLY_SCHEMA)
         )
 
         def handle(request: ServiceRequest) -> bytes:
             if not self._may(request.client_id):
-                log.warning("viewer %d may not call %s: %s", request.client_id, name, STRANGER)
-                return _answer(ok=False, text=f"not allowed: {STRANGER}")
+                log.warning("viewer %d may not call %s: %s", request.client_id, name, NOT_PERMITTED)
+                return _reply(ok=False, text=f"not allowed: {NOT_PERMITTED}")
             try:
-                return _answer(ok=True, text=self._in_loop(act()))
+                return _reply(ok=True, text=self._in_loop(act()))
             except GigabrainError as error:
-                return _answer(ok=False, text=str(error))
+                return _reply(ok=False, text=str(error))
 
         schema = ServiceSchema(
             name=name,
@@ -135,19 +140,19 @@ class FoxgloveRequests:
 
     def _in_loop(self, act: Coroutine[Any, Any, T]) -> T:
         """Return the result of `act` in the event loop. Raises Refused if it takes too long."""
-        doing = asyncio.run_coroutine_threadsafe(act, self._loop)
+        future = asyncio.run_coroutine_threadsafe(act, self._loop)
         try:
-            return doing.result(PATIENCE_S)
+            return future.result(LOOP_TIMEOUT_S)
         except (concurrent.futures.TimeoutError, concurrent.futures.CancelledError):
-            doing.cancel()
+            future.cancel()
             raise Refused("no answer in time; try again") from None
 
 
-def _answer(*, ok: bool, text: str) -> bytes:
+def _reply(*, ok: bool, text: str) -> bytes:
     return msgspec.json.encode({"ok": ok, "text": text})
 
 
-def _typed(text: str) -> float | str:
+def _number_or_text(text: str) -> float | str:
     """Return the value of a parameter as a number, if it is one."""
     try:
         return float(text)
@@ -156,7 +161,7 @@ def _typed(text: str) -> float | str:
 
 
 def _text(value: object) -> str:
-    """Return the value that a viewer sends as people type it."""
+    """Return a viewer's value as a person would type it."""
     if value is None:
         return "null"
     return f"{value:g}" if isinstance(value, float) else str(value)[:200]
