@@ -13,7 +13,7 @@ from gigabrain_zenoh.geometry.limits import ZERO
 from gigabrain_zenoh.testing.samples import BOOT, body, state
 from gigabrain_zenoh.testing.waiting import settle
 from tests.unit.control.test_control_node import Chain
-from tests.unit.ui.test_page_access import Seated
+from tests.unit.ui.test_page_access import SteeredPage
 
 MINE = GateStatus(mode="enabled", commander="control", enables=1)
 HANDED_BACK = GateStatus(mode="enabled", commander="control", enables=2)
@@ -82,7 +82,7 @@ async def test_commands_say_whether_an_operator_has_the_body() -> None:
     assert said == [False, True, True, False]
 
 
-def with_gate(page: Seated, enables: int) -> None:
+def with_gate(page: SteeredPage, enables: int) -> None:
     gate = GateStatus(mode="enabled", commander="control", enables=enables)
     page.net.two.publish(STATE, state(10, gate=gate))
 
@@ -91,19 +91,19 @@ def with_gate(page: Seated, enables: int) -> None:
 async def test_a_viewer_that_ends_after_the_body_was_handed_back_says_nothing_more(
     last_word: str,
 ) -> None:
-    page = Seated()
+    page = SteeredPage()
     with_gate(page, enables=1)
     await settle()
     for at_s in (1.0, 1.1, 1.2):
-        page.seat.drive(page.one, Velocity(linear_x=0.1), at_s)
+        page.arbiter.drive(page.one, Velocity(linear_x=0.1), at_s)
     with_gate(page, enables=2)
     await settle()
     if last_word == "lets go":
-        page.seat.drive(page.one, ZERO, 1.25)
+        page.arbiter.drive(page.one, ZERO, 1.25)
     elif last_word == "leaves":
-        page.seat.leave(page.one)
+        page.arbiter.leave(page.one)
     else:
-        page.seat.clear()
+        page.arbiter.clear()
     await settle()
     assert page.speeds == [0.1, 0.1]
-    assert page.seat.driving(1.26) == 0
+    assert page.arbiter.driving(1.26) == 0

@@ -60,7 +60,7 @@ def check(config: PageConfig) -> None:
 
 
 def _check_certificate(certificate: str, key: str) -> None:
-    """Raise ConfigError for files with which TLS cannot be served."""
+    """Raise ConfigError for files that cannot serve TLS."""
 
     def refuse() -> str:
         raise ConfigError(
@@ -85,18 +85,18 @@ def _check_certificate(certificate: str, key: str) -> None:
 
 
 def token_file(named: str) -> Path:
-    """Return the path of the token file: `named`, or the default if that is empty."""
+    """Return the path of the token file: `named`, or the default one if it is empty."""
     return Path(named) if named else state_dir() / "page" / "tokens.json"
 
 
 def tokens(path: Path) -> tuple[Tokens, bool]:
-    """Return the tokens in a private file, and whether it was made now. Raises ConfigError."""
-    fresh = Tokens(
+    """Return the tokens in a private file, and whether the file is new. Raises ConfigError."""
+    new_tokens = Tokens(
         operator=secrets.token_urlsafe(TOKEN_BYTES), viewer=secrets.token_urlsafe(TOKEN_BYTES)
     )
-    held, made = made_once(path, msgspec.json.encode(fresh))
+    content, is_new = made_once(path, msgspec.json.encode(new_tokens))
     try:
-        return msgspec.json.decode(held, type=Tokens), made
+        return msgspec.json.decode(content, type=Tokens), is_new
     except DECODE_ERRORS as error:
         raise ConfigError(f"{path}: {error}; remove the file to have new tokens made") from None
 
@@ -105,21 +105,21 @@ class Access:
     """Decides which requests and tokens are accepted."""
 
     def __init__(self, config: PageConfig, port: int) -> None:
-        self._tokens, self.made = None, False
+        self._tokens, self.tokens_are_new = None, False
         if wants_login(config):
-            self._tokens, self.made = tokens(token_file(config.tokens))
+            self._tokens, self.tokens_are_new = tokens(token_file(config.tokens))
         self._scheme = "https" if config.certificate else "http"
         local = LOOPBACK_NAMES if is_loopback(config.listen) else ()
         names = {_in_header(name) for name in (config.listen, *local, *config.names)}
         self._hosts = {f"{name}:{port}" for name in names}
         if port == PORTS[self._scheme]:
             self._hosts |= names  # browsers leave out the default port
-        # with any port, as a tunnel has another one: no other site can have such a name
+        # these may have any port, as a tunnel has its own; no other site can have such a name
         self._loopback = {name for name in names if is_loopback(name.strip("[]"))}
 
     def new_tokens_text(self) -> str:
-        """Return the tokens in words if they were made now, else an empty text."""
-        if self._tokens is None or not self.made:
+        """Return the tokens with their uses if they are new, else an empty text."""
+        if self._tokens is None or not self.tokens_are_new:
             return ""
         return f"to drive:     {self._tokens.operator}\nto view only: {self._tokens.viewer}"
 
@@ -127,9 +127,9 @@ class Access:
         """Return the role of a token; None if it is unknown."""
         if self._tokens is None:
             return "operator"
-        if _same(token, self._tokens.operator):
+        if _equal(token, self._tokens.operator):
             return "operator"
-        return "viewer" if _same(token, self._tokens.viewer) else None
+        return "viewer" if _equal(token, self._tokens.viewer) else None
 
     def named(self, headers: Mapping[str, str]) -> bool:
         """Return whether the Host is a name of this page (DNS rebinding, RFC 9110 7.2)."""
@@ -148,5 +148,5 @@ def _in_header(name: str) -> str:
     return f"[{ipaddress.ip_address(name)}]" if ":" in name and is_ip(name) else name
 
 
-def _same(one: str, other: str) -> bool:
+def _equal(one: str, other: str) -> bool:
     return hmac.compare_digest(one.encode(), other.encode())

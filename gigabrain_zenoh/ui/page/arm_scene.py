@@ -1,4 +1,4 @@
-"""An arm in three dimensions for browsers, where no simulation sends its world."""
+"""An arm in three dimensions for browsers, if no simulation publishes its world."""
 
 import itertools
 import struct
@@ -9,7 +9,7 @@ from gigabrain_schemas.body import RobotState
 from gigabrain_schemas.sim import SHAPE_KINDS, SimPoses, SimScene
 from gigabrain_zenoh.geometry.link_model import AXES, LinkModel, Place, turn
 
-ROBOT = "robot/"  # begins the names of its links, as in a simulation
+NAME_PREFIX = "robot/"  # of a link's name in the scene, as in a simulation
 _versions = itertools.count(1)
 
 
@@ -26,7 +26,7 @@ class ArmScene:
         return SimScene(
             version=self._version,
             world="arm",
-            bodies=("", *(f"{ROBOT}{link.name}" for link in self._links.links)),
+            bodies=("", *(f"{NAME_PREFIX}{link.name}" for link in self._links.links)),
             kinds=bytes(SHAPE_KINDS.index(shape.kind) for shape in shapes),
             owners=struct.pack(f"<{len(shapes)}H", *(shape.link + 1 for shape in shapes)),
             sizes=_packed(value for shape in shapes for value in shape.size),
@@ -37,11 +37,11 @@ class ArmScene:
         )
 
     def poses(self, state: RobotState, base: Pose) -> SimPoses:
-        """Return where the links are, with the robot at `base`."""
+        """Return the poses of the links, with the robot at `base`."""
         measured = {joint.name: joint.position for joint in state.joints}
-        here = Place((base.x, base.y, 0.0), turn(AXES["z"], base.yaw))
+        base_place = Place((base.x, base.y, 0.0), turn(AXES["z"], base.yaw))
         places = self._links.places_in_base(measured)
-        return SimPoses(version=self._version, poses=_poses(here @ place for place in places))
+        return SimPoses(version=self._version, poses=_poses(base_place @ place for place in places))
 
 
 def _poses(places: Iterable[Place]) -> bytes:

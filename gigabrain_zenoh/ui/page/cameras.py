@@ -1,7 +1,7 @@
 """Cameras for browsers: each browser gets the newest picture after it has shown the last.
 
-So a slow browser gets fewer pictures, and none waits in the network. Nothing is received from the
-bus while no browser has the panel open.
+So a slow browser gets fewer pictures, and no picture waits in the network. Pictures are received
+from the bus only while a browser has the panel open.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -20,56 +20,56 @@ from gigabrain_zenoh.host.bounded import put_newest
 from gigabrain_zenoh.ui.camera_feed import CameraFeed
 from gigabrain_zenoh.ui.page import frames
 
-PICTURE_INTERVAL_NS = 190_000_000  # shortest time between two pictures of a camera
+MIN_PICTURE_INTERVAL_NS = 190_000_000  # of a camera, for one browser
 SHOWN_TIMEOUT_NS = 3_000_000_000  # a picture counts as lost after this time
-RECOGNISED_TICKS = 25  # longest time between two pictures with detections
-MAX_TICKS = 50  # an older picture means that time has started again
+MAX_PAIRED_TICKS = 25  # between pictures with detections, to show only these
+RESTART_TICKS = 50  # a picture so much older means that the robot's clock has restarted
 MAX_NAMES = 16  # of cameras and perceptors
 
 
 class Watch(Struct, frozen=True, forbid_unknown_fields=True):
-    """Frame of a browser: which pictures it shows."""
+    """Frame of a browser: the pictures that it wants."""
 
     open: bool = False  # its panel of cameras
     folded: Annotated[tuple[Name, ...], Meta(max_length=MAX_NAMES)] = ()  # cameras without pictures
 
 
 class Shown(Struct, frozen=True, forbid_unknown_fields=True):
-    """Frame of a browser: it has shown a picture of a camera, and may get the next one."""
+    """Frame of a browser: it has shown a camera's picture, and can receive the next one."""
 
     camera: Name
 
 
 class PicturePace:
-    """Pictures of one browser: which it wants, and which it has not shown yet."""
+    """Paces the pictures of one browser: it gets the next one after it has shown the last one."""
 
     def __init__(self) -> None:
         self.watch = Watch()
         self._waiting: set[str] = set()  # cameras whose last picture it has not shown yet
-        self._sent: dict[str, tuple[int, int]] = {}  # number and time of the last one, by camera
+        self._sent: dict[str, tuple[int, int]] = {}  # number and time of the last picture
 
     def set_watch(self, watch: Watch) -> None:
-        """Begin again with what is wanted now."""
+        """Set the wanted pictures, and forget those sent before."""
         self.watch = watch
         self._waiting.clear()
         self._sent.clear()
 
     def shown(self, camera: str) -> None:
-        """Note that the browser has shown a picture."""
+        """Store that the browser has shown a camera's last picture."""
         self._waiting.discard(camera)
 
     def wants(self, camera: str) -> bool:
-        """Return whether the browser shows a camera."""
+        """Return whether the browser wants a camera's pictures."""
         return self.watch.open and camera not in self.watch.folded
 
     def is_ready(self, camera: str, now_ns: int) -> bool:
         """Return whether a new picture of a camera may be sent."""
-        since_ns = now_ns - self._sent.get(camera, (0, -PICTURE_INTERVAL_NS))[1]
+        since_ns = now_ns - self._sent.get(camera, (0, -MIN_PICTURE_INTERVAL_NS))[1]
         waiting = camera in self._waiting and since_ns < SHOWN_TIMEOUT_NS
-        return self.wants(camera) and not waiting and since_ns >= PICTURE_INTERVAL_NS
+        return self.wants(camera) and not waiting and since_ns >= MIN_PICTURE_INTERVAL_NS
 
     def take(self, camera: str, number: int, now_ns: int) -> bool:
-        """Note that a picture is sent; return False if it was sent before."""
+        """Store that a picture is sent; return False if it was sent before."""
         if self._sent.get(camera, (0, 0))[0] == number:
             return False
         put_newest(self._sent, camera, (number, now_ns), MAX_NAMES)
@@ -78,7 +78,7 @@ class PicturePace:
 
 
 class CameraFrames:
-    """Frames of cameras: pictures and detections for those who watch, problems for all.
+    """Frames of cameras: pictures and detections for browsers that watch, problems for all.
 
     `send` passes a frame and its slot to all viewers.
     """
@@ -88,15 +88,15 @@ class CameraFrames:
         self._feed = CameraFeed(bus, IMAGE, DETECTIONS)
         self._newest: dict[str, tuple[int, bytes]] = {}  # number and frame, by camera
         self._polled: dict[str, Image] = {}  # the newest picture, by camera
-        self._shown: dict[str, int] = {}  # exposure of the last picture sent, by camera
-        self._recognised: dict[str, tuple[int, int]] = {}  # last two exposures, by camera
-        self._found: dict[str, bytes] = {}  # frame of what was recognised in the last, by camera
+        self._shown: dict[str, int] = {}  # tick of the last picture sent, by camera
+        self._recognised: dict[str, tuple[int, int]] = {}  # ticks of the last two detections
+        self._found: dict[str, bytes] = {}  # frame of the newest detections, by camera
         self._problems: dict[str, tuple[str, str]] = {}  # of the camera, and of its picture
         self._kept: dict[str, bytes] = {}
         bus.subscribe(CAMERA, self._on_info)
 
     def kept_frames(self) -> Iterator[tuple[str, bytes]]:
-        """Yield what is known of cameras, for a new viewer."""
+        """Yield the frames of the cameras' problems, for a new viewer."""
         yield from self._kept.items()
 
     def new_frames(
@@ -125,10 +125,10 @@ class CameraFrames:
                         yield pace, f"found/{camera}", self._found[camera]
 
     def _add(self, found: Detections) -> str:
-        """Keep what was recognised; return its camera."""
+        """Keep new detections; return their camera."""
         camera, (_, last) = found.camera, self._recognised.get(found.camera, (0, 0))
         put_newest(self._recognised, camera, (last, found.basis), MAX_NAMES)
-        frame = frames.as_json(frames.FOUND, _without_poses(found))
+        frame = frames.as_json(frames.FOUND, _overlay_of(found))
         put_newest(self._found, camera, frame, MAX_NAMES)
         return camera
 
@@ -136,8 +136,8 @@ class CameraFrames:
         """Return whether things are recognised often enough to show only those pictures."""
         before, last = self._recognised.get(camera, (0, 0))
         newest = self._polled.get(camera)
-        often = 0 < last - before <= RECOGNISED_TICKS
-        return often and newest is not None and newest.basis - last <= RECOGNISED_TICKS
+        often = 0 < last - before <= MAX_PAIRED_TICKS
+        return often and newest is not None and newest.basis - last <= MAX_PAIRED_TICKS
 
     def _picture(self, camera: str) -> tuple[int, bytes]:
         """Return the newest picture and its number; the number is 0 without one."""
@@ -145,8 +145,8 @@ class CameraFrames:
         image = self._image(camera)
         if image is None:
             return number, frame
-        problem = _problem_of(image)
-        self._note(camera, self._problems.get(camera, ("", ""))[0], problem)
+        problem = _picture_problem(image)
+        self._set_problem(camera, self._problems.get(camera, ("", ""))[0], problem)
         if problem:
             return 0, b""
         newest = number + 1, frames.image_frame(camera, image)
@@ -156,8 +156,8 @@ class CameraFrames:
     def _image(self, camera: str) -> Image | None:
         """Return the next picture to show; None if there is none.
 
-        While things are recognised, it is the one that they were recognised in: boxes of a picture
-        drawn over a later one are beside the things when the robot turns.
+        While things are recognised, it is the picture of the newest detections. Over a later one,
+        boxes would be beside the things when the robot turns.
         """
         image = self._feed.poll(IMAGE, camera)
         newest = image if isinstance(image, Image) else self._polled.get(camera)
@@ -166,8 +166,8 @@ class CameraFrames:
         put_newest(self._polled, camera, newest, MAX_NAMES)
         if self._is_paired(camera):
             last = self._recognised[camera][1]
-            behind = self._shown.get(camera, -MAX_TICKS) - last
-            image = None if 0 <= behind < MAX_TICKS else self._feed.picture_at(camera, last)
+            behind = self._shown.get(camera, -RESTART_TICKS) - last
+            image = None if 0 <= behind < RESTART_TICKS else self._feed.picture_at(camera, last)
         if not isinstance(image, Image):
             return None
         put_newest(self._shown, camera, image.basis, MAX_NAMES)
@@ -175,9 +175,9 @@ class CameraFrames:
 
     def _on_info(self, key: str, info: CameraInfo) -> None:
         camera = key.removeprefix(f"{CAMERA.key}/")
-        self._note(camera, info.problem, self._problems.get(camera, ("", ""))[1])
+        self._set_problem(camera, info.problem, self._problems.get(camera, ("", ""))[1])
 
-    def _note(self, camera: str, problem: str, picture: str) -> None:
+    def _set_problem(self, camera: str, problem: str, picture: str) -> None:
         """Send the problem of a camera when it changes."""
         if self._problems.get(camera) != (problem, picture):
             put_newest(self._problems, camera, (problem, picture), MAX_NAMES)
@@ -187,8 +187,8 @@ class CameraFrames:
             self._send(f"camera/{camera}", frame)
 
 
-def _problem_of(image: Image) -> str:
-    """Return why a browser should not be given a picture; an empty text if it may be."""
+def _picture_problem(image: Image) -> str:
+    """Return a reason not to send a picture to browsers; an empty text without one."""
     if image.encoding != "jpeg":
         return ""
     from gigabrain_zenoh.vision.pictures import check_jpeg  # numpy, for pictures only
@@ -200,8 +200,8 @@ def _problem_of(image: Image) -> str:
     return ""
 
 
-def _without_poses(found: Detections) -> dict[str, Any]:
-    """Return what is drawn over a picture, rounded."""
+def _overlay_of(found: Detections) -> dict[str, Any]:
+    """Return the rounded values that browsers draw over a picture."""
     return {
         "camera": found.camera,
         "width": found.width,
@@ -234,7 +234,7 @@ class SurroundingsFrames:
         self._drawn_basis, self._drawn = -1, False
 
     def watch(self, on: bool) -> None:
-        """Begin or end to receive findings."""
+        """Start or stop receiving findings."""
         self._feed.watch(on)
 
     def new_frames(self, world: WorldModel | None) -> Iterator[tuple[str, bytes]]:
@@ -253,7 +253,7 @@ class SurroundingsFrames:
 
 
 def _rounded(one: Contour) -> dict[str, Any]:
-    """Return a contour to the millimetre: at ten a second, digits count."""
+    """Round a contour to millimetres, as ten are sent a second."""
     return {
         "polygon": [[round(x, 3), round(y, 3)] for x, y in one.polygon],
         "bottom": round(one.bottom, 3),

@@ -42,8 +42,8 @@ ABOUT, STATE, SCAN, MAP, HEALTH, LOG, REPLY, IMAGE, TASK = range(1, 10)  # to th
 SCENE, POSES, ZONES = 10, 11, 12
 CAMERA, FOUND, CONTOURS, PERCEIVED, OBJECTS, ARM_PLAN = range(13, 19)
 LOGIN, DRIVE, ASK, WATCH, SHOWN, JOG = range(1, 7)  # from the browser
-ENTERED = ("goal", "world", "zones", "process", "name", "value")  # by a person, in a request
-MAX_KEPT_LINES = 30  # of the log, for viewers that connect later
+ENTERED_FIELDS = ("goal", "world", "zones", "process", "name", "value")  # typed by a person
+MAX_KEPT_LOG_LINES = 30  # for viewers that connect later
 
 log = logging.getLogger(__name__)
 
@@ -62,7 +62,7 @@ class About(Struct, frozen=True, kw_only=True):
 
 
 class StateFrame(Struct, frozen=True, kw_only=True):
-    """Present state of the robot; None for what is not fresh."""
+    """Present state of the robot; values that are not fresh are None."""
 
     state: RobotState | None
     pose: Pose | None  # in the map if there is one, else by odometry
@@ -98,7 +98,7 @@ class PageRequest(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
         "estop", "release", "enable", "take", "goal", "cancel", "settings", "set", "world",
         "zones", "maps", "map_save", "map_load", "hold", "limp",
     ]  # fmt: skip
-    estop_generation: Count = 0  # as the page shows it: a newer e-stop is not released unseen
+    estop_generation: Count = 0  # the one that the page shows, so that no newer one is released
     goal: GoalRequest | None = None
     world: SimRequest | None = None
     zones: ZonesRequest | None = None
@@ -189,7 +189,7 @@ def decoded(content: bytes, kind: type[T]) -> T:
 
 
 def request_of(content: bytes) -> PageRequest | PageReply:
-    """Return the request in a frame, or its refusal if a value in it was entered wrong.
+    """Return the request in a frame, or its refusal if a person entered a wrong value.
 
     Raises ValueError for a frame that the page never sends.
     """
@@ -197,8 +197,8 @@ def request_of(content: bytes) -> PageRequest | PageReply:
         return decoded(content, PageRequest)
     except ValueError as error:
         fields = decoded(content, dict[str, Any])
-        made = {name: value for name, value in fields.items() if name not in ENTERED}
-        request = decoded(msgspec.json.encode(made), PageRequest)
+        checked = {name: value for name, value in fields.items() if name not in ENTERED_FIELDS}
+        request = decoded(msgspec.json.encode(checked), PageRequest)
         return PageReply(id=request.id, what=request.what, ok=False, text=plain(error))
 
 
@@ -213,7 +213,7 @@ class PageView(ViewerScene):
     ) -> None:
         self._send, self._on_body = send, on_body
         self._kept: dict[str, bytes] = {}  # map, task, objects and scene, by slot
-        self._lines: list[bytes] = []
+        self._log_lines: list[bytes] = []
         self._described: BodyDescription | None = None
         self._numbers = itertools.count()
         self._zones = Zones()
@@ -222,13 +222,13 @@ class PageView(ViewerScene):
         bus.latest(topics.OBJECT_MAP, lambda one: self._keep("objects", as_json(OBJECTS, one)))
         self.newest_of(topics.SIM_POSES)
         self._links: LinkModel | None = None  # of an arm
-        self._arm: ArmScene | None = None  # where no simulation sends its world
+        self._arm: ArmScene | None = None  # if no simulation publishes its world
         self._arm_models = bus.latest(topics.ARM_MODEL, self._on_arm_model)
         self._scenes = bus.latest(topics.SIM_SCENE, self._on_scene)
         self._end_plans: Close | None = None
 
     def watch_plans(self, on: bool) -> None:
-        """Begin or end to receive the plans of an arm, which are made for those who look."""
+        """Start or stop receiving an arm's plans; they are computed only for subscribers."""
         if on and self._end_plans is None:
             self._end_plans = self.bus.subscribe(topics.ARM_PLAN, self._on_plan)
         elif not on and self._end_plans:
@@ -270,24 +270,24 @@ class PageView(ViewerScene):
         """Yield the frames for a new viewer: map, task, health and log."""
         yield from self._kept.items()
         yield from ((f"health/{name}", as_json(HEALTH, one)) for name, one in self.health.items())
-        yield from ((f"log/{next(self._numbers)}", frame) for frame in self._lines)
+        yield from ((f"log/{next(self._numbers)}", frame) for frame in self._log_lines)
 
     def joint_speeds(self, jog: Jog) -> dict[str, float]:
-        """Return the speeds of joints [rad/s or m/s] that a browser wants."""
+        """Return the joint speeds [rad/s or m/s] that a browser's frame commands."""
         state = self.state.fresh()
         if jog.tool is None or self._links is None or self.body is None or state is None:
             return jog.speeds
         return tool_speeds(self._links, self.body.description, state, jog.tool) | jog.speeds
 
     def hold_joints(self) -> bool:
-        """Have control hold the joints while the brain may move them; return whether it may.
+        """Take the joints from the brain, so that control holds them; return whether it had them.
 
-        It holds them until the gate is enabled again.
+        Control holds them until the gate is enabled again.
         """
         state = self.state.fresh()
         joints = self.body.description.joints if self.body else ()
-        moves = state and state.gate.mode == "enabled" and state.gate.commander == BRAIN
-        if not moves or not joints:
+        brain_drives = state and state.gate.mode == "enabled" and state.gate.commander == BRAIN
+        if not brain_drives or not joints:
             return False
         self.publish({joint.name: 0.0 for joint in joints})
         return True
@@ -302,7 +302,7 @@ class PageView(ViewerScene):
             self._send(f"health/{message.process}", as_json(HEALTH, message))
         elif isinstance(message, LogRecord):
             frame = as_json(LOG, message)
-            self._lines = [*self._lines[1 - MAX_KEPT_LINES :], frame]
+            self._log_lines = [*self._log_lines[1 - MAX_KEPT_LOG_LINES :], frame]
             self._send(f"log/{next(self._numbers)}", frame)
         elif isinstance(message, OccupancyGrid):
             self._keep("map", map_frame(message))
@@ -330,7 +330,7 @@ class PageView(ViewerScene):
         self._keep("arm_plan", as_json(ARM_PLAN, content))
 
     def _on_zones(self, zones: Zones) -> None:
-        """Send zones that have changed; they are published again and again."""
+        """Send zones only when they change, as they are published repeatedly."""
         before, self._zones = self._zones, zones
         if (zones.zones, zones.places, zones.map) != (before.zones, before.places, before.map):
             self._keep("zones", as_json(ZONES, zones))

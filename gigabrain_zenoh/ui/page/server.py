@@ -27,7 +27,7 @@ log = logging.getLogger(__name__)
 
 STATIC = Path(__file__).parent / "static"
 MAX_CONNECTIONS = 512  # of all kinds
-MAX_SILENT = 64  # connections without a request; the oldest gives way to the newest
+MAX_SILENT = 64  # connections without a request; a new one replaces the oldest
 MAX_FRAME_BYTES = 16_384  # from a browser: a zone with all its corners
 REQUEST_TIMEOUT_S = 5.0
 FRAME_INTERVAL_NS = 100_000_000
@@ -41,16 +41,16 @@ HEADERS = {
 
 
 class ImpatientProtocol(H11Protocol):
-    """HTTP that closes connections without a request, so that they keep no browser out."""
+    """HTTP that closes connections without a request, so that browsers can always connect."""
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         """Watch a new connection; close the oldest silent one if there are too many."""
         super().connection_made(transport)
-        self._since_s = self.loop.time()
+        self._opened_s = self.loop.time()
         self._timer = self.loop.call_later(REQUEST_TIMEOUT_S, self._check)
         silent = [c for c in self.connections if isinstance(c, ImpatientProtocol) and c.silent]
         if len(silent) > MAX_SILENT:
-            min(silent, key=lambda connection: connection._since_s).transport.close()
+            min(silent, key=lambda connection: connection._opened_s).transport.close()
 
     def connection_lost(self, exc: Exception | None) -> None:
         """Stop watching."""
@@ -66,7 +66,7 @@ class ImpatientProtocol(H11Protocol):
 
     def _check(self) -> None:
         if self.transport.get_protocol() is not self:
-            return  # a WebSocket by now, whose login has a timeout of its own
+            return  # it is a WebSocket now, and its login has its own timeout
         if self.silent:
             self.transport.close()
         self._timer = self.loop.call_later(REQUEST_TIMEOUT_S, self._check)
@@ -144,7 +144,7 @@ def _announce(config: PageConfig, access: Access, port: int) -> None:
     log.info("operator page at %s://%s:%d", scheme, host, port)
     if wants_login(config):
         log.info("its tokens are in %s", token_file(config.tokens))
-    if config.tell_tokens and access.made:
+    if config.tell_tokens and access.tokens_are_new:
         print(access.new_tokens_text(), flush=True)
 
 
@@ -175,4 +175,4 @@ async def _send_frames(bus: Bus, sessions: Sessions) -> None:
     numbers = itertools.count()
     async for _ in bus.clock.every(FRAME_INTERVAL_NS):
         bus.counters["frames"] = next(numbers)
-        sessions.send_news()
+        sessions.send_new_frames()

@@ -45,13 +45,13 @@ from gigabrain_zenoh.ui.steering import RateLimiter, TeleopArbiter
 log = logging.getLogger(__name__)
 
 LOGIN_TIMEOUT_S = 5.0
-WRONG_TOKEN_DELAY_S = 0.5  # before the answer to a wrong token
-MAX_VIEWERS = 16  # browsers at a time; a viewer gives way to an operator
-MAX_OPERATORS = 64  # each of them can stop the robot, so the number of viewers keeps none out
-MAX_LOGINS = 64  # browsers that have not logged in; the oldest gives way to the newest
+WRONG_TOKEN_DELAY_S = 0.5  # before the answer, against guessing
+MAX_VIEWERS = 16  # connected browsers; an operator replaces a viewer
+MAX_OPERATORS = 64  # more than MAX_VIEWERS, as each operator can stop the robot
+MAX_LOGINS = 64  # browsers that have not logged in; a new one replaces the oldest
 MAX_PENDING = 8  # requests of one viewer under way; e-stops do not count
 MAX_REPLY_CHARS = 500
-MAX_REASON_BYTES = 120  # of a reason for closing
+MAX_REASON_BYTES = 120  # of the reason for closing a WebSocket
 MAX_WAITING_FRAMES = 64  # for a slow browser
 BAD_FRAME, WRONG_TOKEN, FULL = 1008, 4401, 4429  # codes for closing a WebSocket (RFC 6455 7.4)
 Admission = Role | Literal["late"] | None  # None for a wrong token
@@ -61,17 +61,17 @@ OTHER_STEERS = PageReply(
 
 
 class Viewer:
-    """Frames that wait for one browser: the newest of each slot; lines of the log give way."""
+    """Queue of frames for one browser: the newest of each slot. Log lines are dropped first."""
 
     def __init__(self, number: int, role: Role) -> None:
         self.number, self.role = number, role
         self.pace = PicturePace()
-        self.gives_way = asyncio.Event()
+        self.replaced = asyncio.Event()
         self._slots: dict[str, bytes] = {}
         self._filled = asyncio.Event()
 
     def queue(self, slot: str, frame: bytes) -> None:
-        """Send `frame` instead of what still waits in its slot. Never waits."""
+        """Replace the frame that waits in `slot`, or add one, without waiting."""
         self._slots[slot] = frame
         while len(self._slots) > MAX_WAITING_FRAMES:
             del self._slots[min(self._slots, key=lambda slot: not slot.startswith("log/"))]
@@ -153,7 +153,7 @@ class RequestHandler:
         return reply.text, reply.robot_type
 
     async def _let_go(self, request: PageRequest) -> GateReply:
-        """Let go of an arm, or hold a limp one."""
+        """Let an arm go limp, or hold a limp one."""
         limp = request.what == "limp"
         if limp and request.value != "yes":
             raise Refused("an arm that is let go of may fall: a person must agree to it first")
@@ -198,7 +198,7 @@ def _text_of(replies: Sequence[GoalReply | TaskReply]) -> str:
 
 
 class Sessions:
-    """All viewers, and what serves them: the view of the robot, steering and requests."""
+    """Serves all viewers: frames of the robot, steering and requests."""
 
     def __init__(self, bus: Bus, access: Access) -> None:
         self._access = access
@@ -220,8 +220,8 @@ class Sessions:
         for viewer in self.viewers:
             viewer.queue(slot, frame)
 
-    def send_news(self) -> None:
-        """Send the present state, scan and pictures to the viewers; receive nothing for none."""
+    def send_new_frames(self) -> None:
+        """Send the newest frames to the viewers; without viewers, receive nothing from the bus."""
         self._surroundings.watch(bool(self.viewers))
         self._view.watch_plans(bool(self.viewers))
         by_pace = {viewer.pace: viewer for viewer in self.viewers}
@@ -244,7 +244,7 @@ class Sessions:
             task.cancel()
 
     async def talk(self, socket: WebSocket) -> None:
-        """Serve one browser from its login to its end."""
+        """Serve one browser from its login until it disconnects."""
         if not self._access.own_page(socket.headers):
             log.warning("refused a page of another origin")
             await socket.close(BAD_FRAME, "the page is of another origin")
@@ -252,22 +252,22 @@ class Sessions:
         await socket.accept()
         with contextlib.suppress(WebSocketDisconnect):
             role = await self._admit(socket)
-            if role is None or role == "late" or not self._has_place(role):
+            if role is None or role == "late" or not self._has_room(role):
                 await socket.close(FULL if role else WRONG_TOKEN)
                 return
             viewer = Viewer(next(self._numbers), role)
             await self._serve_viewer(socket, viewer)
-            if viewer.gives_way.is_set():
+            if viewer.replaced.is_set():
                 await socket.close(FULL, "replaced by an operator")
 
-    def _has_place(self, role: Role) -> bool:
-        """Return whether one more is admitted; for an operator a viewer gives way."""
+    def _has_room(self, role: Role) -> bool:
+        """Return whether one more browser is admitted; an operator may replace a viewer."""
         if role != "operator":
             return len(self.viewers) < MAX_VIEWERS
-        looking = [each for each in self.viewers if each.role != "operator"]
-        if len(self.viewers) >= MAX_VIEWERS and looking:
-            looking[0].gives_way.set()
-            self.viewers.remove(looking[0])
+        others = [viewer for viewer in self.viewers if viewer.role != "operator"]
+        if len(self.viewers) >= MAX_VIEWERS and others:
+            others[0].replaced.set()
+            self.viewers.remove(others[0])
         return len(self.viewers) < MAX_OPERATORS
 
     async def _admit(self, socket: WebSocket) -> Admission:
@@ -305,7 +305,7 @@ class Sessions:
         tasks = (
             asyncio.ensure_future(_send_frames(socket, viewer)),
             asyncio.ensure_future(self._receive(socket, viewer)),
-            asyncio.ensure_future(viewer.gives_way.wait()),
+            asyncio.ensure_future(viewer.replaced.wait()),
         )
         try:
             await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
@@ -349,7 +349,7 @@ class Sessions:
                 return
 
     def _process(self, viewer: Viewer, frame: bytes) -> None:
-        """Process one frame. Raises ValueError for one that our page never sends."""
+        """Process one frame. Raises ValueError for a frame that our page never sends."""
         now_s = self._loop.time()
         if self._rates.is_exceeded(viewer.number, now_s):
             raise ValueError("too many frames")

@@ -1,7 +1,4 @@
-"""The place of an arm's tool, and the speeds of joints that move it along a line.
-
-The speeds are found by damped least squares.
-"""
+"""The place of an arm's tool, and joint speeds that move it along a line (damped least squares)."""
 
 import math
 from collections.abc import Sequence
@@ -9,22 +6,22 @@ from collections.abc import Sequence
 from gigabrain_schemas.body import BodyDescription, JointDescription, RobotState
 from gigabrain_zenoh.geometry.link_model import LinkModel, Vector, cross, rotated
 
-DAMPING_M = 0.02  # [m/rad]; joints that move the tool less are hardly used
-STEP = 1e-5  # [rad] or [m], for the numerical gradient
-NEAR_LIMIT = 0.02  # [rad] or [m], a joint this near to an end of its range moves no nearer
+DAMPING_M = 0.02  # [m/rad]; joints that move the tool less hardly move
+GRADIENT_STEP = 1e-5  # [rad] or [m]
+LIMIT_MARGIN = 0.02  # [rad] or [m]; a joint so close to the end of its range moves no closer
 
 
-ToolPlace = tuple[float, float, float, float]  # x, y, z [m], and how far it points down [rad]
+ToolPlace = tuple[float, float, float, float]  # x, y, z [m], and pitch [rad], positive is down
 
 
 def tool_place(model: LinkModel, body: BodyDescription, state: RobotState) -> ToolPlace | None:
     """Return the place of the arm's tool in the frame of its base; None if unknown."""
-    at = {joint.name: joint.position for joint in state.joints}
+    positions = {joint.name: joint.position for joint in state.joints}
     tool = body.arm.tool if body.arm else ""
     known = tool in (link.name for link in model.links)
-    if not known or any(joint.name not in at for joint in body.joints):
+    if not known or any(joint.name not in positions for joint in body.joints):
         return None
-    place = model.place_in_base(tool, at)
+    place = model.place_in_base(tool, positions)
     ahead, aside, up = rotated(place.rotation, (1.0, 0.0, 0.0))
     return *place.position, -math.atan2(up, math.hypot(ahead, aside))
 
@@ -34,41 +31,45 @@ def tool_speeds(
 ) -> dict[str, float]:
     """Return the speeds of the arm's joints at which its tool moves by `wanted` [m/s].
 
-    The tool's direction is not kept. If a joint would be too fast, all are scaled down. Empty if
-    the model has no such tool, or a joint is not measured.
+    The tool may turn on its way. If a joint would be too fast, all are scaled down. Empty if the
+    model does not have the tool, or a joint is not measured.
     """
-    at = {joint.name: joint.position for joint in state.joints}
+    positions = {joint.name: joint.position for joint in state.joints}
     tool = body.arm.tool if body.arm else ""
     joints = [joint for joint in body.joints if joint.part == "arm"]
-    if tool not in (link.name for link in model.links) or any(j.name not in at for j in joints):
+    if tool not in (link.name for link in model.links) or any(
+        j.name not in positions for j in joints
+    ):
         return {}
-    columns = {joint.name: _gradient(model, tool, at, joint.name) for joint in joints}
+    columns = {joint.name: _gradient(model, tool, positions, joint.name) for joint in joints}
     free = list(joints)
     while True:
         speeds = _least_squares([columns[joint.name] for joint in free], wanted)
         pairs = list(zip(free, speeds, strict=True))
-        still = [joint for joint, speed in pairs if not _at_end(joint, at[joint.name], speed)]
-        if len(still) == len(free):
+        movable = [
+            joint for joint, speed in pairs if not _at_end(joint, positions[joint.name], speed)
+        ]
+        if len(movable) == len(free):
             break
-        free = still
-    over = max([1.0, *(abs(speed) / joint.max_speed for joint, speed in pairs)])
-    found = {joint.name: speed / over for joint, speed in pairs}
-    return {joint.name: found.get(joint.name, 0.0) for joint in joints}
+        free = movable
+    excess = max([1.0, *(abs(speed) / joint.max_speed for joint, speed in pairs)])
+    scaled = {joint.name: speed / excess for joint, speed in pairs}
+    return {joint.name: scaled.get(joint.name, 0.0) for joint in joints}
 
 
-def _gradient(model: LinkModel, tool: str, at: dict[str, float], joint: str) -> Vector:
-    """Return how far the tool moves for a joint's position [m/rad or m/m], along x, y and z."""
-    here, there = (
-        model.place_in_base(tool, {**at, joint: at[joint] + step}).position
-        for step in (-STEP, STEP)
+def _gradient(model: LinkModel, tool: str, positions: dict[str, float], joint: str) -> Vector:
+    """Return the derivative of the tool's x, y, z by a joint's position [m/rad or m/m]."""
+    before, after = (
+        model.place_in_base(tool, {**positions, joint: positions[joint] + step}).position
+        for step in (-GRADIENT_STEP, GRADIENT_STEP)
     )
-    x, y, z = ((b - a) / (2 * STEP) for a, b in zip(here, there, strict=True))
+    x, y, z = ((b - a) / (2 * GRADIENT_STEP) for a, b in zip(before, after, strict=True))
     return x, y, z
 
 
 def _at_end(joint: JointDescription, position: float, speed: float) -> bool:
-    left = joint.upper - position if speed > 0 else position - joint.lower
-    return speed != 0 and left < NEAR_LIMIT
+    remaining = joint.upper - position if speed > 0 else position - joint.lower
+    return speed != 0 and remaining < LIMIT_MARGIN
 
 
 def _least_squares(columns: Sequence[Vector], wanted: Vector) -> list[float]:
@@ -79,9 +80,9 @@ def _least_squares(columns: Sequence[Vector], wanted: Vector) -> list[float]:
         [_dot(rows[i], rows[j]) + (damping if i == j else 0.0) for j in range(3)] for i in range(3)
     )
     bc, ca, ab = cross(b, c), cross(c, a), cross(a, b)
-    whole = _dot(a, bc)  # the determinant; the matrix is symmetric
-    by = [_dot(wanted, part) / whole for part in (bc, ca, ab)]
-    return [_dot(column, by) for column in columns]
+    determinant = _dot(a, bc)
+    solved = [_dot(wanted, row) / determinant for row in (bc, ca, ab)]  # the matrix is symmetric
+    return [_dot(column, solved) for column in columns]
 
 
 def _dot(a: Sequence[float], b: Sequence[float]) -> float:

@@ -1,4 +1,4 @@
-"""Joints that viewers of the page move, and the arm that it draws without a simulation."""
+"""Joints that viewers of the page move, and the arm that the page draws without a simulation."""
 
 import struct
 from collections.abc import Sequence
@@ -34,7 +34,7 @@ PAN = "shoulder_pan"
 
 
 class Page:
-    """The page's view of a robot, and what a viewer's commands become."""
+    """The page's view of a robot. It records the commands that result from a viewer's."""
 
     def __init__(self, body: object = DRIVES) -> None:
         self.net, self.sent = Net(), list[tuple[str, bytes]]()
@@ -51,8 +51,8 @@ class Page:
         return [dict(zip(one.name, one.velocity, strict=True)) for one in self.jogged]
 
     def jog(self, speeds: dict[str, float], times_s: Sequence[float], viewer: int = 1) -> bool:
-        answers = [self.arbiter.jog(viewer, speeds, at_s) for at_s in times_s]
-        return False not in answers
+        accepted = [self.arbiter.jog(viewer, speeds, at_s) for at_s in times_s]
+        return all(accepted)
 
     def state(self, *joints: Joint) -> None:
         here = Pose(x=0.0, y=0.0, yaw=0.0)
@@ -60,12 +60,12 @@ class Page:
         self.net.two.publish(STATE, state)
 
 
-async def test_a_joint_moves_no_faster_than_it_can_after_a_tenth_of_a_second() -> None:
+async def test_joint_speeds_are_limited_and_start_after_100_ms() -> None:
     page = Page()
     await settle()
     assert page.jog({PAN: -9.0, "none": 1.0}, (1.0, 1.04, 1.08))
     await settle()
-    assert page.speeds == []  # as commands that a network had buffered
+    assert page.speeds == []  # a network may have buffered these commands
     assert page.jog({PAN: -9.0, "none": 1.0}, (1.12,))
     assert page.jog({PAN: 0.0}, (1.16,))
     assert page.arbiter.driving(1.16) == 0
@@ -74,7 +74,7 @@ async def test_a_joint_moves_no_faster_than_it_can_after_a_tenth_of_a_second() -
     assert page.steered == []
 
 
-async def test_joints_that_the_body_has_not_are_nothing_to_steer() -> None:
+async def test_speeds_of_unknown_joints_are_ignored() -> None:
     page = Page()
     await settle()
     assert page.jog({"none": 1.0}, (1.0, 1.1, 1.2))
@@ -83,14 +83,14 @@ async def test_joints_that_the_body_has_not_are_nothing_to_steer() -> None:
     assert page.jogged == []
 
 
-async def test_base_and_joints_move_at_once_and_end_each_by_itself() -> None:
+async def test_base_and_joints_move_at_once_and_stop_separately() -> None:
     page, ahead = Page(), Velocity(linear_x=0.2)
     await settle()
     for at_s in (1.0, 1.1, 1.2):
         page.arbiter.drive(1, ahead, at_s)
         page.jog({PAN: 1.0}, (at_s,))
     assert not page.jog({PAN: 1.0}, (1.2,), viewer=2)
-    assert page.jog({PAN: 0.0}, (1.2,), viewer=2)  # nothing, and it ends nothing
+    assert page.jog({PAN: 0.0}, (1.2,), viewer=2)  # it is ignored
     page.arbiter.drive(1, ZERO, 1.24)
     assert page.arbiter.driving(1.24) == 1
     page.jog({PAN: 1.0}, (1.24,))  # goes on without a pause
@@ -102,7 +102,7 @@ async def test_base_and_joints_move_at_once_and_end_each_by_itself() -> None:
 
 
 @pytest.mark.parametrize("end", ["leave", "clear"])
-async def test_a_viewer_that_leaves_and_an_e_stop_end_both(end: str) -> None:
+async def test_a_leaving_viewer_or_an_e_stop_ends_both_streams(end: str) -> None:
     page, ahead = Page(), Velocity(linear_x=0.2)
     await settle()
     for at_s in (1.0, 1.1):
@@ -126,7 +126,7 @@ async def test_a_viewer_that_leaves_and_an_e_stop_end_both(end: str) -> None:
      b'{"speeds":{"a":"fast"}}', b'{"speeds":{"":1}, "more":1}',
      msgspec.json.encode({"speeds": {f"joint{n}": 1.0 for n in range(33)}})],
 )  # fmt: skip
-def test_speeds_that_no_page_sends_are_refused(content: bytes) -> None:
+def test_invalid_joint_speeds_are_refused(content: bytes) -> None:
     with pytest.raises(ValueError, match=r"JSON|[Ee]xpected|unknown|range|truncated"):
         decoded(content, Jog)
     assert decoded(b'{"speeds":{"pan":-1}}', Jog).speeds == {"pan": -1.0}
@@ -136,7 +136,7 @@ def poses_of(frame: bytes) -> np.ndarray:
     return np.frombuffer(frame[8:], "<f4").reshape(-1, 7)
 
 
-async def test_an_arm_without_a_simulation_is_drawn_where_its_kinematics_have_it() -> None:
+async def test_an_arm_without_a_simulation_is_drawn_by_its_kinematics() -> None:
     page = Page(ARM)
     page.net.two.publish(ARM_MODEL, ArmModel(mjcf=MODEL))
     posture = np.array([0.5, -0.4, 0.8, 0.3, -1.0])
@@ -160,7 +160,7 @@ async def test_an_arm_without_a_simulation_is_drawn_where_its_kinematics_have_it
     np.testing.assert_allclose(tool[:3], expected.position, atol=1e-6)
 
 
-async def test_a_simulation_shows_its_arm_itself() -> None:
+async def test_the_arm_of_a_simulation_is_shown_by_the_simulation() -> None:
     page = Page(ARM)
     page.net.two.publish(ARM_MODEL, ArmModel(mjcf=MODEL))
     await settle()
@@ -173,7 +173,7 @@ async def test_a_simulation_shows_its_arm_itself() -> None:
     assert [slot for slot, _ in page.view.new_frames()] == []
 
 
-async def test_a_model_that_is_none_is_logged_and_draws_nothing(
+async def test_a_broken_arm_model_is_logged_and_draws_nothing(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     page = Page(ARM)

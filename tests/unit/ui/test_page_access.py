@@ -35,7 +35,7 @@ from gigabrain_zenoh.ui.page.sessions import RequestHandler, Viewer
 from gigabrain_zenoh.ui.steering import RateLimiter, TeleopArbiter
 
 
-def test_tokens_are_made_once_for_their_owner_alone(tmp_path: Path) -> None:
+def test_tokens_are_created_once_and_readable_only_by_their_owner(tmp_path: Path) -> None:
     path = tmp_path / "page" / "tokens.json"
     made, new = tokens(path)
     assert new
@@ -50,7 +50,7 @@ def test_tokens_are_made_once_for_their_owner_alone(tmp_path: Path) -> None:
         tokens(path)
 
 
-def test_processes_that_make_tokens_at_once_get_the_same(tmp_path: Path) -> None:
+def test_processes_that_create_tokens_at_the_same_time_get_the_same_ones(tmp_path: Path) -> None:
     for number, start in enumerate(("none", "none", "empty", "empty")):
         path = tmp_path / f"tokens-{number}.json"
         if start == "empty":
@@ -143,7 +143,7 @@ def test_new_tokens_are_printed_once(tmp_path: Path) -> None:
     assert Access(PageConfig(), 8080).new_tokens_text() == ""
 
 
-def test_beyond_loopback_it_wants_tls_and_a_token(tmp_path: Path) -> None:
+def test_a_page_for_the_network_requires_tls_and_a_token(tmp_path: Path) -> None:
     check(PageConfig())
     for listen in ("0.0.0.0", "192.168.1.10", "::"):
         with pytest.raises(ConfigError, match="can be reached from the network"):
@@ -185,7 +185,7 @@ def test_beyond_loopback_it_wants_tls_and_a_token(tmp_path: Path) -> None:
         ("", "", False, False),
     ],
 )
-def test_it_answers_to_its_own_names_and_to_its_own_pages(
+def test_it_accepts_only_its_own_names_and_its_own_pages(
     host: str, origin: str, named: bool, own: bool
 ) -> None:
     access = Access(PageConfig(names=("robot.lan",)), 8080)
@@ -205,15 +205,13 @@ def test_it_answers_to_its_own_names_and_to_its_own_pages(
         (PageConfig(), 80, "localhost:80"),
     ],
 )
-def test_it_answers_to_names_as_browsers_write_them(
-    config: PageConfig, port: int, host: str
-) -> None:
+def test_it_accepts_names_as_browsers_write_them(config: PageConfig, port: int, host: str) -> None:
     access = Access(config, port)
     assert access.own_page({"host": host, "origin": f"http://{host}"})
     assert not access.named({"host": f"x{host}"})
 
 
-def test_a_page_for_the_network_answers_to_no_name_of_loopback(tmp_path: Path) -> None:
+def test_a_page_for_the_network_refuses_loopback_names(tmp_path: Path) -> None:
     config = PageConfig(listen="192.168.1.10", tokens=str(tmp_path / "tokens.json"))
     assert not Access(config, 8080).named({"host": "localhost:8080"})
 
@@ -229,7 +227,7 @@ async def test_a_slow_browser_gets_the_newest_and_never_more_than_64_frames() ->
     assert await viewer.next_frame() == b"936"
 
 
-async def test_lines_of_the_log_displace_nothing_else_for_a_slow_browser() -> None:
+async def test_log_lines_displace_no_other_frames_of_a_slow_browser() -> None:
     viewer = Viewer(1, "viewer")
     once = [b"about", b"map", b"zones", b"reply/1"]
     for frame in once:
@@ -241,7 +239,7 @@ async def test_lines_of_the_log_displace_nothing_else_for_a_slow_browser() -> No
     assert got == [*once, *(b"log %d" % n for n in range(41, 100)), b"state"]
 
 
-def test_of_each_viewer_120_messages_a_second_are_processed() -> None:
+def test_120_messages_a_second_are_processed_per_viewer() -> None:
     rates = RateLimiter()
     assert not any(rates.is_exceeded(1, 10.0 + n / 200) for n in range(120))
     assert rates.is_exceeded(1, 10.7)
@@ -249,17 +247,17 @@ def test_of_each_viewer_120_messages_a_second_are_processed() -> None:
     assert not rates.is_exceeded(1, 11.1)
 
 
-class Seated:
-    """A page with two viewers and a Waffle; the test gives the time."""
+class SteeredPage:
+    """A page with two viewers and a Waffle. The test passes the time of each command."""
 
-    def __init__(self, tell: Callable[[str, bytes], None] = lambda _slot, _frame: None) -> None:
+    def __init__(self, send: Callable[[str, bytes], None] = lambda _slot, _frame: None) -> None:
         self.net, self.steered = Net(), list[Twist]()
-        self.scene = PageView(self.net.one, tell)
+        self.scene = PageView(self.net.one, send)
         self.net.two.subscribe(TELEOP, lambda _key, twist: self.steered.append(twist))
         self.net.two.publish(
             BODY, Body(description=load_robot("turtlebot3_waffle").description(), link="sim")
         )
-        self.seat = TeleopArbiter(self.scene)
+        self.arbiter = TeleopArbiter(self.scene)
         self.one, self.two = 1, 2
 
     @property
@@ -267,47 +265,47 @@ class Seated:
         return [twist.linear_x for twist in self.steered]
 
 
-async def test_one_viewer_steers_until_it_lets_go_or_falls_silent() -> None:
-    page = Seated()
+async def test_one_viewer_steers_until_it_releases_or_stops_sending() -> None:
+    page = SteeredPage()
     await settle()
     fast, slow = Velocity(linear_x=9.0), Velocity(linear_x=0.1)
-    assert page.seat.drive(page.one, fast, 0.0)
-    assert page.seat.drive(page.one, fast, 0.1)
-    assert not page.seat.drive(page.two, slow, 0.5)
-    assert page.seat.drive(page.two, ZERO, 0.5)  # says nothing, and does not end the other's
-    assert page.seat.drive(page.two, slow, 0.7)
-    assert page.seat.drive(page.two, slow, 0.8)
-    page.seat.leave(page.one)
-    assert page.seat.driving(0.8) == 2
-    assert page.seat.drive(page.two, ZERO, 0.8)
-    assert page.seat.driving(0.8) == 0
-    page.seat.leave(page.one)
+    assert page.arbiter.drive(page.one, fast, 0.0)
+    assert page.arbiter.drive(page.one, fast, 0.1)
+    assert not page.arbiter.drive(page.two, slow, 0.5)
+    assert page.arbiter.drive(page.two, ZERO, 0.5)  # ignored, and ends no other stream
+    assert page.arbiter.drive(page.two, slow, 0.7)
+    assert page.arbiter.drive(page.two, slow, 0.8)
+    page.arbiter.leave(page.one)
+    assert page.arbiter.driving(0.8) == 2
+    assert page.arbiter.drive(page.two, ZERO, 0.8)
+    assert page.arbiter.driving(0.8) == 0
+    page.arbiter.leave(page.one)
     await settle()
     assert page.speeds == [0.26, 0.1, 0.0]
 
 
-async def test_what_is_held_while_the_gate_is_latched_steers_only_after_a_pause() -> None:
-    page, ahead = Seated(), Velocity(linear_x=0.1)
+async def test_a_stream_during_a_latch_steers_only_after_a_pause() -> None:
+    page, ahead = SteeredPage(), Velocity(linear_x=0.1)
 
     async def held(*at_s: float, mode: GateMode) -> list[float]:
         page.net.two.publish(STATE, state(10, gate=GateStatus(mode=mode, commander="control")))
         await settle()
         page.steered.clear()
         for each in at_s:
-            page.seat.drive(page.one, ahead, each)
+            page.arbiter.drive(page.one, ahead, each)
         await settle()
         return page.speeds
 
     assert await held(0.0, 0.1, mode="enabled") == [0.1]
     assert await held(0.2, 0.3, mode="latched") == []
     assert await held(0.4, 0.5, 0.6, mode="enabled") == []
-    page.seat.drive(page.one, ZERO, 0.65)  # let go
+    page.arbiter.drive(page.one, ZERO, 0.65)  # released
     assert await held(0.7, 0.8, mode="enabled") == [0.1]
     assert await held(0.9, mode="latched") == []
     assert await held(1.2, 1.3, mode="enabled") == [0.1]
 
 
-async def test_two_pages_are_two_sources_though_both_are_called_page() -> None:
+async def test_two_pages_with_the_same_name_are_two_sources() -> None:
     net, sources = Net(), list[str]()
     net.one.subscribe(TELEOP, lambda _key, twist: sources.append(twist.source))
     for bus in (net.two, Bus(net.two.transport, net.two.clock, net.two.process)):
@@ -318,30 +316,30 @@ async def test_two_pages_are_two_sources_though_both_are_called_page() -> None:
 
 
 async def test_commands_buffered_by_a_network_do_not_steer() -> None:
-    page = Seated()
+    page = SteeredPage()
     await settle()
     for at_s in (1.0, 1.04, 1.08):
-        page.seat.drive(page.one, Velocity(linear_x=0.1), at_s)
+        page.arbiter.drive(page.one, Velocity(linear_x=0.1), at_s)
     await settle()
     assert page.speeds == []
-    page.seat.drive(page.one, Velocity(linear_x=0.1), 1.12)
+    page.arbiter.drive(page.one, Velocity(linear_x=0.1), 1.12)
     for _ in range(75):  # after a cut of three seconds
-        page.seat.drive(page.one, Velocity(linear_x=0.2), 4.12)
-    page.seat.drive(page.one, ZERO, 4.12)
+        page.arbiter.drive(page.one, Velocity(linear_x=0.2), 4.12)
+    page.arbiter.drive(page.one, ZERO, 4.12)
     await settle()
     assert page.speeds == [0.1, 0.0]
 
 
 async def test_a_goal_without_a_server_is_refused_with_the_reason() -> None:
-    page = Seated()
+    page = SteeredPage()
     goal = PageRequest(id=7, what="goal", goal=GoalRequest(x=1.0, y=2.0))
     reply = await RequestHandler(page.net.one).handle(goal)
     assert (reply.id, reply.ok) == (7, False)
     assert reply.text == "no process serves goals: this robot runs no navigation"
 
 
-async def test_an_arm_is_not_let_go_of_unless_a_person_has_agreed() -> None:
-    page, asked = Seated(), list[bool]()
+async def test_an_arm_goes_limp_only_if_a_person_agrees() -> None:
+    page, asked = SteeredPage(), list[bool]()
 
     async def let_go(request: LimpRequest) -> GateReply:
         asked.append(request.limp)
@@ -372,7 +370,7 @@ def test_a_demo_on_a_shared_machine_prints_an_address_that_logs_in(
     assert address == f"http://127.0.0.1:{deployment.page.port}"
 
 
-def test_a_port_that_is_taken_is_stepped_aside_from() -> None:
+def test_a_taken_port_is_replaced_by_a_free_one() -> None:
     import socket
 
     with socket.create_server(("127.0.0.1", 0)) as taken:

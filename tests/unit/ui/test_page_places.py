@@ -1,4 +1,4 @@
-"""Places at the operator page: a viewer gives way to an operator."""
+"""Number of browsers at the operator page: an operator replaces a viewer."""
 
 import asyncio
 import contextlib
@@ -26,8 +26,8 @@ class Socket(WebSocket):
         scope = {"type": "websocket", "path": "/ws", "query_string": b""}
         scope |= {"headers": [(b"host", HOST.encode()), (b"origin", f"http://{HOST}".encode())]}
         super().__init__(scope, self.receive, self.send)
-        self.said: asyncio.Queue[bytes] = asyncio.Queue()
-        self.got: list[bytes] = []
+        self.to_server: asyncio.Queue[bytes] = asyncio.Queue()
+        self.received: list[bytes] = []
         self.code = 0
         self.ended = asyncio.Event()
 
@@ -35,10 +35,10 @@ class Socket(WebSocket):
         pass
 
     async def receive(self) -> dict[str, bytes]:  # type: ignore[override]
-        return {"type": "websocket.receive", "bytes": await self.said.get()}  # type: ignore[dict-item]
+        return {"type": "websocket.receive", "bytes": await self.to_server.get()}  # type: ignore[dict-item]
 
     async def send_bytes(self, data: bytes) -> None:
-        self.got.append(data)
+        self.received.append(data)
 
     async def close(self, code: int = 1000, reason: str | None = None) -> None:
         if self.code:
@@ -56,11 +56,11 @@ class Page:
         self.sessions = Sessions(self.net.one, Access(config, 8080))
         self._talks: list[asyncio.Task[None]] = []
 
-    async def comes(self, token: str = "") -> Socket:
-        """Connect a browser, with a token or silent."""
+    async def connect(self, token: str = "") -> Socket:
+        """Connect a browser. Without a token, it sends nothing."""
         socket = Socket()
         if token:
-            socket.said.put_nowait(frames.as_json(frames.LOGIN, frames.Login(token=token)))
+            socket.to_server.put_nowait(frames.as_json(frames.LOGIN, frames.Login(token=token)))
         self._talks.append(asyncio.ensure_future(self.sessions.talk(socket)))
         for _ in range(3):
             await settle()
@@ -76,43 +76,43 @@ class Page:
 
 @pytest.fixture
 async def page(tmp_path: Path) -> AsyncIterator[Page]:
-    made = Page(tmp_path)
-    yield made
-    await made.close()
+    page = Page(tmp_path)
+    yield page
+    await page.close()
 
 
-async def test_20_viewers_keep_no_operator_out_and_the_oldest_viewer_gives_way(page: Page) -> None:
-    viewers = [await page.comes(page.tokens.viewer) for _ in range(20)]
+async def test_an_operator_replaces_the_oldest_of_20_viewers(page: Page) -> None:
+    viewers = [await page.connect(page.tokens.viewer) for _ in range(20)]
     assert [viewer.code for viewer in viewers] == [0] * 16 + [4429] * 4
-    operator = await page.comes(page.tokens.operator)
+    operator = await page.connect(page.tokens.operator)
     assert operator.code == 0
-    assert operator.got
+    assert operator.received
     assert [viewer.code for viewer in viewers[:3]] == [4429, 0, 0]
     assert len(page.sessions.viewers) == 16
-    assert (await page.comes(page.tokens.viewer)).code == 4429  # the place is not his again
+    assert (await page.connect(page.tokens.viewer)).code == 4429  # the page is full again
 
 
 @pytest.mark.long
-async def test_operators_get_in_though_all_places_are_taken_by_operators(page: Page) -> None:
-    operators = [await page.comes(page.tokens.operator) for _ in range(65)]
+async def test_64_operators_are_admitted(page: Page) -> None:
+    operators = [await page.connect(page.tokens.operator) for _ in range(65)]
     assert [operator.code for operator in operators] == [0] * 64 + [4429]
 
 
-async def test_200_browsers_without_a_login_keep_no_operator_out(page: Page) -> None:
-    silent = [await page.comes() for _ in range(200)]
+async def test_an_operator_is_admitted_beside_200_browsers_without_a_login(page: Page) -> None:
+    silent = [await page.connect() for _ in range(200)]
     assert [each.code for each in silent] == [4429] * 136 + [0] * 64
-    operator = await page.comes(page.tokens.operator)
+    operator = await page.connect(page.tokens.operator)
     assert (operator.code, len(page.sessions.viewers)) == (0, 1)
 
 
-async def test_a_browser_that_logs_in_late_is_told_to_come_again_and_keeps_its_token(
+async def test_a_browser_that_logs_in_late_is_asked_to_retry_with_its_token(
     page: Page, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(sessions, "LOGIN_TIMEOUT_S", 0.01)
-    late = await page.comes()
+    late = await page.connect()
     await until(lambda: late.code)
     assert late.code == 4429
-    wrong = await page.comes("not-a-token-of-this-page")
+    wrong = await page.connect("not-a-token-of-this-page")
     await until(lambda: wrong.code)
     assert wrong.code == 4401
 
@@ -154,12 +154,12 @@ TRIANGLE = [[0, 0], [1, 0], [1, 1]]
 async def test_a_value_out_of_bounds_is_refused_and_the_browser_stays_connected(
     page: Page, wanted: dict[str, object], text: str
 ) -> None:
-    operator = await page.comes(page.tokens.operator)
-    operator.said.put_nowait(frames.as_json(frames.ASK, {"id": 3, **wanted}))
+    operator = await page.connect(page.tokens.operator)
+    operator.to_server.put_nowait(frames.as_json(frames.ASK, {"id": 3, **wanted}))
     for _ in range(5):
         await settle()
     assert operator.code == 0
-    replies = [frame for frame in operator.got if frame[0] == frames.REPLY]
+    replies = [frame for frame in operator.received if frame[0] == frames.REPLY]
     assert [msgspec.json.decode(reply[1:], type=frames.PageReply) for reply in replies] == [
         frames.PageReply(id=3, what=str(wanted["what"]), ok=False, text=text)
     ]

@@ -1,4 +1,4 @@
-"""An arm's tool goes where the page's buttons send it, and no joint beyond its range or speed."""
+"""The page's buttons move an arm's tool, within the ranges and speeds of its joints."""
 
 import math
 
@@ -22,48 +22,52 @@ READY = {
 }
 
 
-class Jogged:
-    """An arm whose joints move as they are told."""
+class SimulatedArm:
+    """An arm whose joints move at the commanded speeds."""
 
     def __init__(self, body: str) -> None:
         mjcf = (BODIES / body / "model.xml").read_text("utf-8")
-        self.about: BodyDescription = load_robot(body).description()
+        self.body_description: BodyDescription = load_robot(body).description()
         self.model = LinkModel(mjcf)
-        self.judge = ArmKinematics(mjcf, self.about.joints)
-        self.at = {joint.name: READY[body].get(joint.name, 0.0) for joint in self.about.joints}
+        self.reference = ArmKinematics(mjcf, self.body_description.joints)
+        self.at = {
+            joint.name: READY[body].get(joint.name, 0.0) for joint in self.body_description.joints
+        }
 
     def speeds(self, wanted: tuple[float, float, float]) -> dict[str, float]:
         joints = tuple(Joint(name=name, position=place) for name, place in self.at.items())
         state = RobotState(
             robot_type="arm", pose=Pose(x=0.0, y=0.0, yaw=0.0), velocity=Velocity(), joints=joints
         )
-        return tool_speeds(self.model, self.about, state, wanted)
+        return tool_speeds(self.model, self.body_description, state, wanted)
 
-    def go(self, wanted: tuple[float, float, float], seconds: float) -> None:
+    def jog(self, wanted: tuple[float, float, float], seconds: float) -> None:
         for _ in range(round(seconds / 0.04)):
             for name, speed in self.speeds(wanted).items():
                 self.at[name] += 0.04 * speed
 
     @property
     def tool(self) -> np.ndarray:
-        return self.judge.forward(np.array([self.at[name] for name in self.judge.names])).position
+        return self.reference.forward(
+            np.array([self.at[name] for name in self.reference.names])
+        ).position
 
 
 @pytest.mark.long
 @pytest.mark.parametrize("body", ["so101", "piper"])
 @pytest.mark.parametrize("wanted", ALONG)
 def test_the_tool_moves_along_the_line(body: str, wanted: tuple[float, float, float]) -> None:
-    arm = Jogged(body)
-    before, gripper = arm.tool, arm.at[arm.about.joints[-1].name]
-    arm.go(wanted, 0.8)
+    arm = SimulatedArm(body)
+    before, gripper = arm.tool, arm.at[arm.body_description.joints[-1].name]
+    arm.jog(wanted, 0.8)
     assert arm.tool - before == pytest.approx(np.multiply(0.8, wanted), abs=0.002)
-    assert arm.at[arm.about.joints[-1].name] == gripper
+    assert arm.at[arm.body_description.joints[-1].name] == gripper
 
 
 @pytest.mark.long
-def test_at_the_edge_of_its_reach_no_joint_is_too_fast_or_leaves_its_range() -> None:
-    arm = Jogged("so101")
-    limits = {joint.name: joint for joint in arm.about.joints}
+def test_joints_stay_within_their_limits_at_the_edge_of_the_reach() -> None:
+    arm = SimulatedArm("so101")
+    limits = {joint.name: joint for joint in arm.body_description.joints}
     for wanted in ((2.0, 0.0, 0.0), (0.0, 2.0, 0.0), (0.0, 0.0, -2.0), (0.0, 0.0, 2.0)):
         for _ in range(100):
             speeds = arm.speeds(wanted)
@@ -74,8 +78,8 @@ def test_at_the_edge_of_its_reach_no_joint_is_too_fast_or_leaves_its_range() -> 
     assert not any(arm.speeds((0.0, 0.0, 0.0)).values())
 
 
-def test_a_joint_at_its_end_stays_and_others_go_on() -> None:
-    arm = Jogged("so101")
+def test_a_joint_at_its_limit_stops_and_the_others_move() -> None:
+    arm = SimulatedArm("so101")
     arm.at["shoulder_pan"] = 1.9
     toward = math.copysign(0.05, arm.tool[1])
     speeds = arm.speeds((0.0, toward, 0.0))
@@ -87,10 +91,12 @@ def test_a_joint_at_its_end_stays_and_others_go_on() -> None:
 
 
 def test_without_the_tool_or_a_measured_joint_nothing_moves() -> None:
-    arm = Jogged("so101")
+    arm = SimulatedArm("so101")
     del arm.at["elbow_flex"]
     assert arm.speeds((0.1, 0.0, 0.0)) == {}
-    arm = Jogged("so101")
-    assert arm.about.arm
-    arm.about = replace(arm.about, arm=replace(arm.about.arm, tool="none"))
+    arm = SimulatedArm("so101")
+    assert arm.body_description.arm
+    arm.body_description = replace(
+        arm.body_description, arm=replace(arm.body_description.arm, tool="none")
+    )
     assert arm.speeds((0.1, 0.0, 0.0)) == {}
