@@ -17,20 +17,20 @@ from gigabrain_zenoh.bus.listening import Sampled
 from gigabrain_zenoh.codec import Codec
 from gigabrain_zenoh.host.bounded import put_newest
 
-MAX_RECENT = 8  # pictures of a camera; detections arrive up to 0.5 s later
+MAX_RECENT_PICTURES = 8  # per camera; detections arrive up to 0.5 s after their picture
 _decode_image = Codec(IMAGE.type, IMAGE.max_bytes).decode
 
 
 class CameraFeed:
-    """Newest message of each camera or perceptor; decoded when it is read.
+    """Keeps the newest message of each camera or perceptor, and decodes it when it is read.
 
-    Of topics with a key for each camera, the first MAX_CAMERAS keys are kept.
+    A topic has at most MAX_CAMERAS keys here; further keys are ignored.
     """
 
     def __init__(self, bus: Bus, *topics: Topic[Any]) -> None:
         self._bus, self._topics = bus, topics
         self._sampled: dict[Topic[Any], dict[str, Sampled[Any]]] = {}
-        self._detections: dict[str, Detections] = {}  # new ones, by camera
+        self._detections: dict[str, Detections] = {}  # not read yet, by camera
         self._recent: dict[str, deque[bytes]] = {}  # the newest pictures, by camera
         self._closes: list[Callable[[], None]] = []
 
@@ -57,7 +57,7 @@ class CameraFeed:
         return list(self._sampled.get(topic, ()))
 
     def poll(self, topic: Topic[Any], name: str) -> Message | None:
-        """Return the newest message of a name since the last call; None if there is none."""
+        """Return the newest message of a name; None if there is no new one since the last call."""
         sampled = self._sampled.get(topic, {}).get(name)
         return sampled.poll() if sampled else None
 
@@ -75,12 +75,13 @@ class CameraFeed:
         yield from found.values()
 
     def _receive(self, topic: Topic[Any], key: str, encoding: str, payload: bytes) -> None:
-        """Keep an encoded payload. In any thread."""
-        held, name = self._sampled.get(topic), key.removeprefix(f"{topic.key}/")
-        if held is not None and (name in held or len(held) < MAX_CAMERAS):
-            held.setdefault(name, Sampled(self._bus, topic)).receive(key, encoding, payload)
+        """Keep an encoded payload. Called in any thread."""
+        by_name, name = self._sampled.get(topic), key.removeprefix(f"{topic.key}/")
+        if by_name is not None and (name in by_name or len(by_name) < MAX_CAMERAS):
+            sampled = by_name.setdefault(name, Sampled(self._bus, topic))
+            sampled.receive(key, encoding, payload)
             if topic is IMAGE and DETECTIONS in self._topics:
-                self._recent.setdefault(name, deque(maxlen=MAX_RECENT)).append(payload)
+                self._recent.setdefault(name, deque(maxlen=MAX_RECENT_PICTURES)).append(payload)
 
     def _add_detections(self, _key: str, found: Detections) -> None:
         put_newest(self._detections, found.camera, found, MAX_CAMERAS)

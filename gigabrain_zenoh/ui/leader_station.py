@@ -12,11 +12,11 @@ from gigabrain_zenoh.geometry.joint_ramp import within
 from gigabrain_zenoh.host.signals import run_until, stop_signals
 from gigabrain_zenoh.ui.teleop_station import keys_of, typed_keys
 
-APPROACH_SPEED = math.radians(45)  # [rad/s], of the follower towards the leader's posture
-# largest joint error [rad] at which a slow approach begins, and at which it ends:
-FAR, NEAR = math.radians(60), math.radians(3)
+APPROACH_SPEED = math.radians(45)  # [rad/s], maximum while the follower is far from the leader
+MAX_FOLLOW_ERROR = math.radians(60)  # [rad]; a larger joint error starts a slow approach
+MAX_APPROACHED_ERROR = math.radians(3)  # [rad]; the approach ends when all errors are smaller
 PROGRESS_TICKS = 50  # between two lines about the approach
-PREFIX = "arm_"  # of joint names of an arm on a base
+JOINT_PREFIX = "arm_"  # joint names of an arm on a base start with it
 HELP = "hold the leader and move it; space: e-stop; x or Ctrl-C: end"
 Posture = Mapping[str, float]  # [rad] by joint
 
@@ -29,11 +29,11 @@ class Leader(Protocol):
 
 
 class LeaderStation:
-    """Sends a leader's posture to a robot at each of its states."""
+    """Sends a leader's posture to a robot, once for each of the robot's states."""
 
-    def __init__(self, robot: Robot, leader: Leader, say: Callable[[str], None]) -> None:
-        self._robot, self._leader, self._say = robot, leader, say
-        self._ended, self._pressed = asyncio.Event(), False
+    def __init__(self, robot: Robot, leader: Leader, show: Callable[[str], None]) -> None:
+        self._robot, self._leader, self._show = robot, leader, show
+        self._ended, self._estop_pressed = asyncio.Event(), False
         self._speed: float | None = APPROACH_SPEED
         self._slow_ticks = 0  # duration of the approach
 
@@ -49,24 +49,24 @@ class LeaderStation:
         if state.gate.mode == "enabled" and not take:
             raise Refused(f"{state.gate.commander} drives; take it over with --take")
         await self._robot.enable(take=take)
-        self._say(HELP)
-        with stop_signals() as signalled, typed_keys(self._type):
-            ends = asyncio.ensure_future(signalled.wait())
-            ends.add_done_callback(lambda _: self._ended.set())
+        self._show(HELP)
+        with stop_signals() as signalled, typed_keys(self._on_typed):
+            waiting = asyncio.ensure_future(signalled.wait())
+            waiting.add_done_callback(lambda _: self._ended.set())
             try:
                 await run_until(self._ended, self._follow(body, wanted))
             finally:
-                ends.cancel()
-        if self._pressed:
+                waiting.cancel()
+        if self._estop_pressed:
             reply = await self._robot.estop("teleop")
-            self._say(f"CONFIRMED by {reply.robot_type}: {reply.text}")
+            self._show(f"CONFIRMED by {reply.robot_type}: {reply.text}")
         else:
             await self._robot.stop()
-            self._say(f"{body.robot_type} holds where it is")
+            self._show(f"{body.robot_type} holds where it is")
 
-    def _type(self, typed: str) -> None:
+    def _on_typed(self, typed: str) -> None:
         for key in keys_of(typed):
-            self._pressed = self._pressed or key == " "
+            self._estop_pressed = self._estop_pressed or key == " "
             if key in (" ", "x", "\x03", "\x04"):
                 self._ended.set()
 
@@ -78,16 +78,16 @@ class LeaderStation:
             wanted = follower_posture(body, await self._leader.read())
 
     def _choose_speed(self, sent: Posture, wanted: Posture) -> None:
-        """Limit the speed until the follower has the leader's posture."""
-        name = max(wanted, key=lambda one: abs(wanted[one] - sent[one]))
-        off = abs(wanted[name] - sent[name])
-        if self._speed and off < NEAR:
-            self._say("following")
+        """Limit the speed while the follower approaches the leader's posture."""
+        name = max(wanted, key=lambda joint: abs(wanted[joint] - sent[joint]))
+        error = abs(wanted[name] - sent[name])
+        if self._speed and error < MAX_APPROACHED_ERROR:
+            self._show("following")
             self._speed, self._slow_ticks = None, 0
-        elif self._speed or off > FAR:
+        elif self._speed or error > MAX_FOLLOW_ERROR:
             if self._slow_ticks % PROGRESS_TICKS == 0:
-                degrees = math.degrees(off)
-                self._say(f"slowly to the leader's posture: {name} has {degrees:.0f} deg to go")
+                degrees = math.degrees(error)
+                self._show(f"slowly to the leader's posture: {name} has {degrees:.0f} deg to go")
             self._speed, self._slow_ticks = APPROACH_SPEED, self._slow_ticks + 1
 
 
@@ -98,12 +98,12 @@ def follower_posture(body: BodyDescription, posture: Posture) -> dict[str, float
     """
     if not body.joints:
         raise Unsupported(f"{body.robot_type} has no arm")
-    found = {}
+    goals = {}
     for joint in body.joints:
-        place = posture.get(joint.name.removeprefix(PREFIX))
-        if place is not None:
-            found[joint.name] = within(joint, place)
-    if len(found) < len(posture):
-        here, there = (", ".join(names) for names in (posture, (j.name for j in body.joints)))
-        raise ConfigError(f"{body.robot_type} cannot follow a leader of {here}; it has {there}")
-    return found
+        position = posture.get(joint.name.removeprefix(JOINT_PREFIX))
+        if position is not None:
+            goals[joint.name] = within(joint, position)
+    if len(goals) < len(posture):
+        leader, own = (", ".join(names) for names in (posture, (j.name for j in body.joints)))
+        raise ConfigError(f"{body.robot_type} cannot follow a leader of {leader}; it has {own}")
+    return goals

@@ -19,8 +19,8 @@ from gigabrain_zenoh.ui.run_report import RunMonitor
 
 FRAMES_HZ = 4
 FAULT_SHOWN_S = 30.0
-LINE_INTERVAL_S = 10.0  # of the robot's time, without a terminal
-ACTIVITIES = {  # of processes that send nothing about the robot
+LINE_INTERVAL_S = 10.0  # of the robot's time, between two lines without a terminal
+ACTIVITIES = {  # of processes whose messages do not show their work
     "router": "connects the processes",
     "relay": "connects the processes",
     "page": "shows the robot in a browser",
@@ -30,8 +30,8 @@ ACTIVITIES = {  # of processes that send nothing about the robot
 GATE_COLOURS = {"enabled": "green", "idle": "yellow", "stopping": "yellow", "latched": "red"}
 
 
-Starting = Callable[[], str]  # processes that are not ready yet, in words; empty if all are
-Where = Callable[[], str]  # address of the operator page, once it is served
+StartingText = Callable[[], str]  # names processes that are not ready yet; empty if all are ready
+PageAddress = Callable[[], str]  # of the operator page; empty until it is served
 
 
 class DemoView(Protocol):
@@ -55,11 +55,11 @@ class HeadlessView:
         self,
         watch: RunMonitor,
         seconds: float | None,
-        page: Where = str,
-        starting: Starting = str,
+        page: PageAddress = str,
+        starting: StartingText = str,
     ) -> None:
         self._watch, self._seconds, self._page, self._starting = watch, seconds, page, starting
-        self._next, self._page_shown = LINE_INTERVAL_S, False
+        self._next_line_s, self._page_shown = LINE_INTERVAL_S, False
         self._in_place = sys.stderr.isatty()
         self._display = Display(writer(sys.stderr), LINES)
 
@@ -74,8 +74,8 @@ class HeadlessView:
 
     def show_fault(self, fault: str) -> None:
         """Print a fault on a line of its own."""
-        below = "\n" if self._in_place else ""  # the line that is redrawn
-        self._display.put(f"{below}{fault}\n")
+        newline = "\n" if self._in_place else ""  # ends the line that is redrawn
+        self._display.put(f"{newline}{fault}\n")
 
     def show(self) -> None:
         """Print the progress, if it is due."""
@@ -83,12 +83,12 @@ class HeadlessView:
         if not self._page_shown and watch.state.newest and (page := self._page()):
             self._display.put(f"operator page: {page}\n")
             self._page_shown = True
-        if not self._in_place and watch.seconds < self._next:
+        if not self._in_place and watch.seconds < self._next_line_s:
             return
-        self._next = watch.seconds + LINE_INTERVAL_S
-        of = f"/{self._seconds:.0f}" if self._seconds else ""
-        does = printable(doing(watch, self._starting()))
-        line = f"{watch.seconds:6.1f}{of} s  {watch.distance_m:6.2f} m  {does}"
+        self._next_line_s = watch.seconds + LINE_INTERVAL_S
+        limit = f"/{self._seconds:.0f}" if self._seconds else ""
+        activity = printable(doing(watch, self._starting()))
+        line = f"{watch.seconds:6.1f}{limit} s  {watch.distance_m:6.2f} m  {activity}"
         if self._in_place:
             self._display.put(f"\r{line[:100]:<100}")
         else:
@@ -106,14 +106,14 @@ class LiveView:
         faults: Sequence[tuple[float, str]],
         seconds: float | None,
         page: str = "",
-        starting: Starting = str,
+        starting: StartingText = str,
     ) -> None:
         self._starting = starting
         self._title = _line(title)
         self._subtitle = _line(f"{page} · Ctrl-C ends it" if page else "Ctrl-C ends it")
         self._watch, self._supervisor = watch, supervisor
         self._faults, self._seconds = faults, seconds
-        # drawn on the loop's thread, so that all values are of one time
+        # drawn in the event loop, so that all values are of the same moment
         self._live = Live(self._page(), screen=True, auto_refresh=False)
         self._display = Display[Panel](lambda page: self._live.update(page, refresh=True), room=1)
         self._next_s = 0.0
@@ -169,12 +169,12 @@ class LiveView:
         driver = watch.health.get("driver")
         latency = driver.latency_ms if driver else {}
         p50, p99 = latency.get("scan_to_cmd_p50"), latency.get("scan_to_cmd_p99")
-        chain = f"{p50:.1f} ms (p99 {p99:.1f})" if p50 and p99 else "-"
+        latency_text = f"{p50:.1f} ms (p99 {p99:.1f})" if p50 and p99 else "-"
         names = ("driven", "scan → command", "gate", "battery")
         table.add_row(*(Text(name, style="dim") for name in names))
-        of = f" of {self._seconds:.0f}" if self._seconds else ""
-        driven = f"{watch.distance_m:.2f} m in {watch.seconds:.0f}{of} s"
-        table.add_row(driven, chain, gate, battery)
+        limit = f" of {self._seconds:.0f}" if self._seconds else ""
+        driven = f"{watch.distance_m:.2f} m in {watch.seconds:.0f}{limit} s"
+        table.add_row(driven, latency_text, gate, battery)
         return table
 
     def _processes(self) -> Table:
@@ -188,11 +188,11 @@ class LiveView:
         for name, status in self._supervisor.statuses.items():
             ready = status.state == "ready"
             health = self._watch.health.get(name) if ready else None
-            again = f" ↻{status.restarts}" if status.restarts else ""
+            restarts = f" ↻{status.restarts}" if status.restarts else ""
             style = "green" if ready else "red" if status.state == "given up" else "yellow"
             table.add_row(
                 name,
-                _line(f"{status.state}{again}", style),
+                _line(f"{status.state}{restarts}", style),
                 str(status.pid or ""),
                 f"{health.cpu * 100:.1f} %" if health else "",
                 f"{health.rss_bytes / 1e6:.0f} MB" if health else "",
@@ -202,7 +202,7 @@ class LiveView:
 
 
 def _line(text: str, style: str = "", justify: Literal["left", "center"] = "left") -> Text:
-    """Return a line without markup that ends in an ellipsis if it is too long."""
+    """Return a line of plain text, without markup; an ellipsis ends it if it is too long."""
     return Text(printable(text), style=style, justify=justify, no_wrap=True, overflow="ellipsis")
 
 

@@ -25,13 +25,13 @@ from gigabrain_zenoh.errors import Refused
 from gigabrain_zenoh.gate.causes import LATE
 
 UNKNOWN_CELL = b"\xff"
-ASK_S, ASK_PAUSE_S = 1.0, 0.1  # timeout of one query, and pause before the next
+QUERY_TIMEOUT_S, QUERY_PAUSE_S = 1.0, 0.1  # of one query, and before the next
 STARTED_S = psutil.Process().create_time()
 MIN_DISTANCE_M = 0.05  # a shorter distance counts as no motion
 
 
 class StartTimes(Struct, frozen=True, kw_only=True):
-    """Seconds of wall time since the command was started; None for what has not happened."""
+    """Times of events, in seconds of wall time since the command's start; None: not yet."""
 
     state_s: float | None = None  # first state of the body
     motion_s: float | None = None  # MIN_DISTANCE_M driven
@@ -47,7 +47,8 @@ class RunMonitor(SampledView):
         self.distance_m = 0.0  # by odometry
         self.turns = 0  # turns on the spot that the brain decided on
         self._turning = False
-        self._boot = self._tick = self._ticks_before = 0  # those of earlier starts of the driver
+        self._boot = self._tick = 0
+        self._ticks_before = 0  # sum of the driver's earlier starts
         self._last: RobotState | None = None
         super().__init__(bus)
         self.map = bus.latest(MAP)
@@ -63,7 +64,7 @@ class RunMonitor(SampledView):
 
     @property
     def problem(self) -> str:
-        """Return why messages can no longer be processed; an empty text while they are."""
+        """Return the error that ended the processing of messages; an empty text without one."""
         failed = self.bus.failed
         return str(failed.exception()) if failed.done() else ""
 
@@ -88,7 +89,7 @@ class RunMonitor(SampledView):
         return (len(grid.cells) - grid.cells.count(UNKNOWN_CELL)) * grid.resolution**2
 
     def _note_start_times(self) -> None:
-        """Note what has happened since the last look."""
+        """Store the time of each event that happened since the last look."""
         task = self.task.current
         happened = {
             "state_s": self.state.newest is not None,
@@ -96,9 +97,9 @@ class RunMonitor(SampledView):
             "metre_s": self.distance_m >= 1.0,
             "path_s": task is not None and task.path != (),
         }
-        known = {name for name in happened if getattr(self.start_times, name) is not None}
+        stored = {name for name in happened if getattr(self.start_times, name) is not None}
         now_s = round(time.time() - STARTED_S, 2)
-        new = {name: now_s for name, there in happened.items() if there and name not in known}
+        new = {name: now_s for name, now in happened.items() if now and name not in stored}
         self.start_times = structs.replace(self.start_times, **new)
 
     @property
@@ -114,18 +115,21 @@ class RunMonitor(SampledView):
     async def describe(self, process: str, timeout_s: float = 0.3) -> Description | None:
         """Return a process's description of itself; None without an answer in `timeout_s`.
 
-        The query is repeated until then. A machine that stalled may have cost either side its
-        session. The session recovers by itself, but queries in between are lost.
+        The query is repeated until then. After a stall of the machine, either side may have lost
+        its session. The session recovers by itself, but queries in between are lost.
         """
         loop = asyncio.get_running_loop()
         end_s = loop.time() + timeout_s
         while (left_s := end_s - loop.time()) > 0:
             with contextlib.suppress(Refused):
                 for reply in await self.bus.ask(
-                    DESCRIBE, DescribeRequest(), timeout_s=min(left_s, ASK_S), name=process
+                    DESCRIBE,
+                    DescribeRequest(),
+                    timeout_s=min(left_s, QUERY_TIMEOUT_S),
+                    name=process,
                 ):
                     return reply
-            await asyncio.sleep(min(left_s, ASK_PAUSE_S))
+            await asyncio.sleep(min(left_s, QUERY_PAUSE_S))
         return None
 
     def _count_turn(self, intent: Intent | None) -> None:
@@ -163,13 +167,13 @@ class Observed(Struct, frozen=True, kw_only=True):
     speed: float
     seconds: float  # of the robot's time
     distance_m: float  # by odometry
-    drives: bool = True  # it has a base, which is expected to move
+    drives: bool = True  # the body has a base, which is expected to move
     decisions: tuple[tuple[float, str], ...]
     turns: int  # turns on the spot that the brain decided on
     deaths: int
     restarts: int
     rejected: int
-    problem: str = ""  # why the run could not be watched to its end
+    problem: str = ""  # error that ended the observation early
     mapped_m2: float | None = None  # None unless a map is built
     tasks: TaskStatus | None = None  # None where no process has tasks
     start: StartTimes = StartTimes()
@@ -180,8 +184,8 @@ class Report(Struct, frozen=True, kw_only=True):
     """Results of one run. Contacts, clearance and distance are MuJoCo's ground truth.
 
     A body that is not simulated has no ground truth: contacts and clearance are null, and the
-    distance is from odometry. They are null too if the driver did not answer at the end. So are
-    figures that its last health message did not contain.
+    distance is from odometry. They are also null if the driver did not answer at the end. Then
+    figures that its last health message did not contain are null, too.
     """
 
     body: str
@@ -200,7 +204,7 @@ class Report(Struct, frozen=True, kw_only=True):
     lockstep_timeouts: int | None
     decisions: tuple[tuple[float, str], ...]  # simulated time [s] and the decision in words
     mapped_m2: float | None = None  # area of the map known to be free or occupied
-    tasks_done: int = 0  # among the last 16 that ended: goals reached and missions completed
+    tasks_done: int = 0  # goals reached and missions completed, of the last 16 tasks
     start: StartTimes = StartTimes()
     verdict: str  # "ok", or the faults in words
 

@@ -1,4 +1,4 @@
-"""Parts shared by the operator page and the Foxglove bridge: what they show, and steering."""
+"""Parts that the operator page and the Foxglove bridge share: their messages, and steering."""
 
 import functools
 from collections import Counter
@@ -16,9 +16,9 @@ M = TypeVar("M", bound=Message)
 Wanted = Velocity | dict[str, float]  # of the base, or speeds of joints [rad/s or m/s]
 
 LEASE_S = 0.5  # after this time without a command, another viewer may steer
-STREAM_GAP_S = 0.2  # after a longer gap, commands count as a new stream
-MAX_RECEIVED_HZ = 120  # messages of one viewer that are processed; held keys take 25
-SETTLE_S = 0.1  # start of a new stream that is ignored: commands the network had buffered
+MAX_STREAM_GAP_S = 0.2  # after a longer gap, commands count as a new stream
+MAX_RECEIVED_HZ = 120  # messages that are processed per viewer; held keys send 25
+SETTLE_S = 0.1  # a new stream is ignored for so long, as a network may have buffered commands
 
 
 class ViewerScene(SampledView):
@@ -42,7 +42,7 @@ class ViewerScene(SampledView):
         return state is not None and state.gate.mode == "latched"
 
     def publish(self, wanted: Wanted) -> None:
-        """Publish the velocity or the joints' speeds that an operator wants, by the newest tick."""
+        """Publish the velocity or joint speeds that an operator wants, with the newest tick."""
         self.sampled[STATE].poll()
         if isinstance(wanted, Velocity):
             steer(self.bus, wanted)
@@ -51,14 +51,14 @@ class ViewerScene(SampledView):
 
 
 class RateLimiter:
-    """Counts the messages of each viewer in the present second."""
+    """Limits the messages of each viewer to MAX_RECEIVED_HZ."""
 
     def __init__(self) -> None:
         self._second_s = 0.0
         self._received: Counter[int] = Counter()
 
     def is_exceeded(self, viewer: int, now_s: float) -> bool:
-        """Count a message; return whether there are too many of this viewer."""
+        """Count a message; return whether this viewer sent too many in the present second."""
         if now_s - self._second_s >= 1.0:
             self._second_s = now_s
             self._received.clear()
@@ -71,23 +71,23 @@ class _Stream(NamedTuple):
 
     obey_from_s: float
     last_s: float
-    rest: Wanted  # the command that ends them
-    ignored: bool  # it came while the gate was latched, and is obeyed only after a pause
+    rest: Wanted  # the command of zero speeds that ends the stream
+    ignored: bool  # the gate was latched during the stream; a new one is obeyed
 
 
 class TeleopArbiter:
     """Lets one viewer steer at a time, while its commands arrive. Commands are never repeated.
 
-    It may drive the base and move joints at once: each is a stream that ends by itself. One that
-    goes on while the gate is latched is ignored until it has ended, so that what is held through an
-    e-stop does not move the robot after the release.
+    The viewer may drive the base and move joints at once: each is a stream that ends by itself. A
+    stream during which the gate is latched is ignored until its end. So a key held during an e-stop
+    does not move the robot after the release.
     """
 
     def __init__(self, scene: ViewerScene) -> None:
         self._scene = scene
         self._viewer = 0
         self._lease_end_s = 0.0
-        self._streams: dict[type, _Stream] = {}  # of that viewer, by what it wants
+        self._streams: dict[type, _Stream] = {}  # of that viewer, by the type of its commands
         self._enables: int | None = None  # the gate's count when a viewer last steered
 
     def driving(self, now_s: float) -> int:
@@ -105,7 +105,7 @@ class TeleopArbiter:
         return self._pass_on(viewer, clamp(wanted, limits_of(body.description)), ZERO, now_s)
 
     def jog(self, viewer: int, speeds: Mapping[str, float], now_s: float) -> bool:
-        """Pass on the speeds of joints [rad/s or m/s] likewise; unknown joints are left out."""
+        """Pass on speeds of joints [rad/s or m/s], like `drive`; unknown joints are left out."""
         joints = self._scene.body.description.joints if self._scene.body else ()
         limits = {joint.name: joint.max_speed for joint in joints if joint.name in speeds}
         if not limits:
@@ -121,10 +121,10 @@ class TeleopArbiter:
                 return True
             self._streams.clear()
         stream = self._streams.get(type(wanted))
-        goes_on = stream is not None and now_s - stream.last_s <= STREAM_GAP_S
-        obey_from_s = stream.obey_from_s if stream and goes_on else now_s + SETTLE_S
+        continues = stream is not None and now_s - stream.last_s <= MAX_STREAM_GAP_S
+        obey_from_s = stream.obey_from_s if stream and continues else now_s + SETTLE_S
         self._viewer, self._lease_end_s = viewer, now_s + LEASE_S
-        ignored = self._scene.latched or bool(stream and goes_on and stream.ignored)
+        ignored = self._scene.latched or bool(stream and continues and stream.ignored)
         self._streams[type(wanted)] = _Stream(obey_from_s, now_s, rest, ignored)
         if wanted == rest:
             self._end(type(wanted))
@@ -134,12 +134,12 @@ class TeleopArbiter:
         return True
 
     def leave(self, viewer: int) -> None:
-        """Stop the robot if the viewer that leaves was steering it."""
+        """Stop the robot if `viewer`, which leaves, steers it."""
         if viewer == self._viewer:
             self.clear()
 
     def clear(self) -> None:
-        """End steering by any viewer, as when an e-stop was pressed."""
+        """End steering by any viewer, for example after an e-stop."""
         for kind in tuple(self._streams):
             self._end(kind)
 

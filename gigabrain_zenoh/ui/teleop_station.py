@@ -36,8 +36,8 @@ JOINT_KEYS_HELP = "1 2 3 … choose a joint · J K move it"
 PAD_HELP = "gamepad: hold a shoulder button to drive, B stops"
 
 # A terminal repeats a held key first after 0.25 to 0.6 s, then every 30 to 50 ms.
-TAP_S = 0.4  # how long a first press counts as held
-HELD_S = 0.15  # the same for a repeated press: after release, the robot brakes this late
+FIRST_PRESS_S = 0.4  # a key counts as held for so long after its first press
+REPEATED_PRESS_S = 0.15  # the same for a repetition; the robot brakes so long after the release
 SPEED_SHARES = (0.25, 0.5, 0.75, 1.0)  # speed steps, as fractions of the body's limits
 
 Axes = tuple[int, int, int]  # ahead, left, counter-clockwise: -1, 0 or 1
@@ -48,16 +48,16 @@ MOVES: Final[dict[str, Axes]] = {
     "d": (0, 0, -1), "right": (0, 0, -1),
     "q": (0, 1, 0), "e": (0, -1, 0),
 }  # fmt: skip
-JOG_KEYS: Final[dict[str, int]] = {"j": -1, "k": 1}  # of the chosen joint
+JOG_KEYS: Final[dict[str, int]] = {"j": -1, "k": 1}  # direction of the chosen joint
 ARROW_KEYS = {"A": "up", "B": "down", "C": "right", "D": "left"}
-BEGUN_SEQUENCE = re.compile(r"\x1b(?:[\[O][\d;]*)?\Z")  # its rest is still to come
+INCOMPLETE_SEQUENCE = re.compile(r"\x1b(?:[\[O][\d;]*)?\Z")  # at the end of the input
 KEY_PATTERN = re.compile(r"\x1b[\[O](?:\d+(?:;\d+)*)?([A-Za-z~])|(.)", re.DOTALL)
 
 EVENT = struct.Struct("<IhBB")  # milliseconds, value, type, number
-BUTTON, AXIS, INITIAL = 0x01, 0x02, 0x80  # types of events
+BUTTON, AXIS, INITIAL = 0x01, 0x02, 0x80  # bits of an event's type; INITIAL: state when opened
 DEAD_MAN_BUTTONS = (4, 5)  # the shoulder buttons: nothing moves unless one of them is held
-ARM_BUTTON = 5  # the right one moves joints, where there are some, and the left one the base
-JOINT_AXES = (0, 1, 3, 4, 6, 7)  # left stick, right stick, cross: of the joints in their order
+ARM_BUTTON = 5  # of a body with joints, the right one moves these, the left one the base
+JOINT_AXES = (0, 1, 3, 4, 6, 7)  # one for each joint: left stick, right stick, cross
 STOP_BUTTON = 1  # the button at the right (B, circle)
 AHEAD_AXIS, TURN_AXIS, SIDEWAYS_AXIS = 1, 3, 0  # left stick up and down, right stick, left stick
 AXIS_RANGE = 32767.0
@@ -79,27 +79,27 @@ class HeldKeys:
 
     def __init__(self) -> None:
         self._until_s: dict[str, float] = {}
-        self._released: set[str] = set()  # until their next press, which no repeat is
-        self._share = 0
-        self.joint = 0  # index of the chosen one
+        self._released: set[str] = set()  # keys to ignore until their next press; no repetition
+        self._share_index = 0
+        self.joint = 0  # index of the chosen joint
 
     @property
     def share(self) -> float:
         """Return the chosen fraction of the body's limits."""
-        return SPEED_SHARES[self._share]
+        return SPEED_SHARES[self._share_index]
 
     def press(self, key: str, now_s: float) -> bool:
-        """Process a key press; return whether the key is one of those for driving."""
+        """Process a key press; return whether the key is used for driving."""
         if key in ("+", "-"):
             step = 1 if key == "+" else -1
-            self._share = max(0, min(len(SPEED_SHARES) - 1, self._share + step))
+            self._share_index = max(0, min(len(SPEED_SHARES) - 1, self._share_index + step))
         elif key.isdecimal() and key != "0":
             self.joint = int(key) - 1
         elif key in MOVES or key in JOG_KEYS:
             repeated = now_s < self._until_s.get(key, now_s)
             if not repeated:
                 self._released.discard(key)
-            self._until_s[key] = now_s + (HELD_S if repeated else TAP_S)
+            self._until_s[key] = now_s + (REPEATED_PRESS_S if repeated else FIRST_PRESS_S)
         else:
             return False
         return True
@@ -122,9 +122,9 @@ class HeldKeys:
 
     def speeds(self, body: BodyDescription, now_s: float) -> dict[str, float]:
         """Return the speed of the chosen joint [rad/s or m/s]; empty if there is none."""
-        way = sum(JOG_KEYS.get(key, 0) for key in self._held(now_s))
+        direction = sum(JOG_KEYS.get(key, 0) for key in self._held(now_s))
         chosen = body.joints[self.joint : self.joint + 1]
-        return {joint.name: way * self.share * joint.max_speed for joint in chosen}
+        return {joint.name: direction * self.share * joint.max_speed for joint in chosen}
 
     def _held(self, now_s: float) -> list[str]:
         held = (key for key, until_s in self._until_s.items() if now_s < until_s)
@@ -137,14 +137,14 @@ class PadState:
     def __init__(self) -> None:
         self._buttons: dict[int, bool] = {}
         self._axes: dict[int, float] = {}
-        self._rest = b""
+        self._incomplete = b""  # first bytes of an event
 
     def feed(self, data: bytes) -> bool:
         """Process events; return whether one of them is a press of the stop button."""
-        data = self._rest + data
-        whole = len(data) - len(data) % EVENT.size
-        self._rest, stop = data[whole:], False
-        for _, value, kind, number in EVENT.iter_unpack(data[:whole]):
+        data = self._incomplete + data
+        end = len(data) - len(data) % EVENT.size
+        self._incomplete, stop = data[end:], False
+        for _, value, kind, number in EVENT.iter_unpack(data[:end]):
             if kind & BUTTON:
                 pressed = bool(value and not kind & INITIAL)
                 self._buttons[number] = pressed or bool(value and self._buttons.get(number))
@@ -158,12 +158,12 @@ class PadState:
         self._buttons.clear()
 
     def velocity(self, body: BodyDescription, share: float) -> Velocity:
-        """Return the velocity that the sticks ask for, at most `share` of the body's limits."""
+        """Return the velocity that the sticks command, at most `share` of the body's limits."""
         held = any(self._buttons.get(button) for button in DEAD_MAN_BUTTONS)
         if not held or (body.joints and self._buttons.get(ARM_BUTTON)):
             return ZERO
         ahead, turn, left = (
-            -self._pushed(axis) * share for axis in (AHEAD_AXIS, TURN_AXIS, SIDEWAYS_AXIS)
+            -self._deflection(axis) * share for axis in (AHEAD_AXIS, TURN_AXIS, SIDEWAYS_AXIS)
         )
         return Velocity(
             linear_x=ahead * body.max_linear_speed,
@@ -172,13 +172,15 @@ class PadState:
         )
 
     def speeds(self, body: BodyDescription, share: float) -> dict[str, float]:
-        """Return the speeds of joints [rad/s or m/s], at most `share` of their limits."""
+        """Return the joint speeds [rad/s or m/s] of the sticks, at most `share` of the limits."""
         if not self._buttons.get(ARM_BUTTON):
             return {}
         pairs = zip(body.joints, JOINT_AXES, strict=False)
-        return {joint.name: -self._pushed(axis) * share * joint.max_speed for joint, axis in pairs}
+        return {
+            joint.name: -self._deflection(axis) * share * joint.max_speed for joint, axis in pairs
+        }
 
-    def _pushed(self, axis: int) -> float:
+    def _deflection(self, axis: int) -> float:
         value = max(-1.0, min(1.0, self._axes.get(axis, 0.0)))
         return value if abs(value) > DEAD_ZONE else 0.0
 
@@ -227,13 +229,13 @@ class TeleopStation:
         self._keys, self._reply = HeldKeys(), ""
         self._quit = False
         self._body: BodyDescription | None = None
-        self._asking: set[asyncio.Task[None]] = set()
+        self._requests: set[asyncio.Task[None]] = set()  # under way
 
     async def drive(self, take: bool) -> None:
         """Drive until the operator quits; then stop the body and hand it back to the brain.
 
-        It also hands back when it is cancelled. Raises Refused when another operator or the brain
-        drives and `take` is not set.
+        It also hands the body back when it is cancelled. Raises Refused when another operator
+        or the brain drives and `take` is not set.
         """
         body = self._body = await self._robot.read_body()
         state = await self._robot.read_state()
@@ -243,25 +245,25 @@ class TeleopStation:
             await self._enable(take)
         try:
             await self._until_quit(body)
-        finally:  # a signal, and a terminal that was closed, hand back as well
+        finally:  # also after a signal, or if the terminal is closed
             await self._hand_back()
 
     async def _until_quit(self, body: BodyDescription) -> None:
         loop = asyncio.get_running_loop()
         with (
-            typed_keys(self._type),
+            typed_keys(self._on_typed),
             Live(auto_refresh=False, screen=False) as live,
             Display[Text](lambda text: live.update(text, refresh=True), room=1) as display,
         ):
             while not self._quit:
                 if self._robot.state and self._robot.state.gate.mode == "latched":
-                    self._release_all()  # what is held must not move the robot after the release
+                    self._release_all()  # held keys must not move the robot after the release
                 wanted = self._keys.velocity(body, loop.time())
                 if wanted == ZERO and self._pad.pad:
                     wanted = self._pad.pad.velocity(body, self._keys.share)
                 if self._pad.stop.is_set():
                     self._pad.stop.clear()
-                    self._ask("stop")
+                    self._request("stop")
                 if body.has_base:
                     self._robot.steer(wanted)
                 if body.joints:
@@ -276,12 +278,12 @@ class TeleopStation:
         if speeds:
             self._robot.jog(speeds)
 
-    def _type(self, typed: str) -> None:
+    def _on_typed(self, typed: str) -> None:
         for key in keys_of(typed):
             if key in ("x", "\x03", "\x04"):
                 self._quit = True
             elif key in (" ", "r", "g"):
-                self._ask({" ": "stop", "r": "release", "g": "go"}[key])
+                self._request({" ": "stop", "r": "release", "g": "go"}[key])
             else:
                 self._keys.press(key, asyncio.get_running_loop().time())
 
@@ -290,15 +292,15 @@ class TeleopStation:
         if self._pad.pad:
             self._pad.pad.release_all()
 
-    def _ask(self, what: str) -> None:
+    def _request(self, what: str) -> None:
         """Count keys and gamepad as released, then send a request to the gate."""
         self._release_all()
         self._robot.steer(ZERO)
-        task = asyncio.create_task(self._answer(what))
-        self._asking.add(task)
-        task.add_done_callback(self._asking.discard)
+        task = asyncio.create_task(self._carry_out(what))
+        self._requests.add(task)
+        task.add_done_callback(self._requests.discard)
 
-    async def _answer(self, what: str) -> None:
+    async def _carry_out(self, what: str) -> None:
         try:
             if what == "stop":
                 reply = await self._robot.estop("teleop")
@@ -317,7 +319,7 @@ class TeleopStation:
         """Stop the body; enable the brain again only if this station still had the body."""
         self._robot.steer(ZERO)
         try:
-            for task in tuple(self._asking):
+            for task in tuple(self._requests):
                 await task
             state = await self._robot.read_state()
             if state.gate.mode == "enabled" and state.gate.commander == BRAIN:
@@ -358,38 +360,39 @@ def joint_readout(state: RobotState, body: BodyDescription | None, chosen: int) 
     measured = {joint.name: joint.position for joint in state.joints}
     shown = [
         f"{'>' if number == chosen else ''}{number + 1} {joint.name} "
-        + _place(joint, measured[joint.name])
+        + _position_text(joint, measured[joint.name])
         for number, joint in enumerate(body.joints if body else ())
         if joint.name in measured
     ]
     return [" · ".join(shown)] if shown else []
 
 
-def _place(joint: JointDescription, position: float) -> str:
+def _position_text(joint: JointDescription, position: float) -> str:
     sliding = joint.unit == "m"
     return f"{1e3 * position:+.0f} mm" if sliding else f"{math.degrees(position):+.0f}°"
 
 
 @contextmanager
-def typed_keys(take: Callable[[str], None]) -> Iterator[None]:
-    """Pass keys to `take` as they are pressed, without Enter; restore the terminal afterwards."""
+def typed_keys(on_typed: Callable[[str], None]) -> Iterator[None]:
+    """Pass typed text to `on_typed` without waiting for Enter; restore the terminal afterwards."""
     if not sys.stdin.isatty():
         yield
         return
     fd, loop = sys.stdin.fileno(), asyncio.get_running_loop()
-    before, begun = termios.tcgetattr(fd), ""
+    before, incomplete = termios.tcgetattr(fd), ""
 
     def read() -> None:
-        nonlocal begun
-        typed = begun + os.read(fd, 1024).decode(errors="replace")
-        found = BEGUN_SEQUENCE.search(typed)
-        begun = found.group() if found else ""
-        take(typed.removesuffix(begun))
+        nonlocal incomplete
+        typed = incomplete + os.read(fd, 1024).decode(errors="replace")
+        found = INCOMPLETE_SEQUENCE.search(typed)
+        incomplete = found.group() if found else ""
+        on_typed(typed.removesuffix(incomplete))
 
-    keys = termios.tcgetattr(fd)
-    keys[0] &= ~termios.IXON  # Ctrl-S does not stop the display
-    keys[3] &= ~(termios.ICANON | termios.ECHO | termios.ISIG)  # Ctrl-C is a key here, so that the
-    termios.tcsetattr(fd, termios.TCSADRAIN, keys)  # body is stopped before the program ends
+    settings = termios.tcgetattr(fd)
+    settings[0] &= ~termios.IXON  # Ctrl-S does not stop the display
+    # Ctrl-C is an ordinary key, so that the body is stopped before the program ends
+    settings[3] &= ~(termios.ICANON | termios.ECHO | termios.ISIG)
+    termios.tcsetattr(fd, termios.TCSADRAIN, settings)
     loop.add_reader(fd, read)
     try:
         yield

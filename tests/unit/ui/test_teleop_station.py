@@ -39,7 +39,7 @@ from gigabrain_zenoh.ui.teleop_station import (
 )
 
 WAFFLE = load_robot("turtlebot3_waffle")  # 0.26 m/s, 1.82 rad/s
-ALPHA = load_robot("alpha")  # goes sideways as well, 0.2 m/s
+ALPHA = load_robot("alpha")  # 0.2 m/s sideways
 
 
 def test_keys_and_arrows_are_found_among_other_escape_sequences() -> None:
@@ -71,7 +71,7 @@ def test_several_keys_add_up_and_opposite_ones_cancel() -> None:
     assert keys.velocity(WAFFLE, 0.1) == ZERO
 
 
-def test_the_operator_chooses_how_fast_within_what_the_body_can() -> None:
+def test_the_operator_chooses_a_speed_within_the_limits_of_the_body() -> None:
     keys = HeldKeys()
     assert not keys.press("z", 0.0)
     for _ in range(9):
@@ -109,7 +109,7 @@ def test_a_gamepad_moves_nothing_unless_a_dead_man_button_is_held() -> None:
     assert pad.velocity(WAFFLE, 0.5) == ZERO
 
 
-def test_events_may_come_in_pieces_and_a_stick_near_its_middle_is_let_go() -> None:
+def test_events_may_arrive_in_pieces_and_a_stick_near_its_centre_is_released() -> None:
     pad = PadState()
     data = event(1, 1, 4) + event(-3200, 2, 1) + event(-16384, 2, 3)
     for at in range(0, len(data), 3):
@@ -117,7 +117,7 @@ def test_events_may_come_in_pieces_and_a_stick_near_its_middle_is_let_go() -> No
     assert pad.velocity(WAFFLE, 1.0) == Velocity(angular_z=pytest.approx(0.91, abs=0.001))
 
 
-def test_its_stop_button_counts_when_it_is_pressed_and_not_as_it_was_found() -> None:
+def test_a_stop_button_counts_when_pressed_and_not_when_held_at_the_start() -> None:
     pad = PadState()
     assert not pad.feed(event(1, 1 | 0x80, 1))
     assert not pad.feed(event(0, 1, 1))
@@ -166,21 +166,21 @@ def test_the_display_names_commander_causes_and_remedies() -> None:
     ]
 
 
-class Held:
-    """A robot whose gate is enabled for the brain, from which the station takes over."""
+class FakeRobot:
+    """A robot whose gate is enabled for the brain. The station takes it over."""
 
-    def __init__(self, asked: Callable[[], None] = lambda: None) -> None:
+    def __init__(self, on_hand_back: Callable[[], None] = lambda: None) -> None:
         self.state: RobotState | None = None
         self.steered: list[Velocity] = []
         self.enabled = self.pressed = 0
-        self._asked = asked
+        self._on_hand_back = on_hand_back
 
     async def read_body(self) -> object:
         return WAFFLE
 
     async def read_state(self) -> RobotState:
         if self.enabled:
-            self._asked()
+            self._on_hand_back()
         return replace(example(RobotState), gate=GateStatus(mode="enabled", commander=BRAIN))
 
     def steer(self, wanted: Velocity) -> None:
@@ -195,7 +195,7 @@ class Held:
         return replace(example(GateReply), text="open")
 
 
-async def cancelled_while_driving(robot: Held, folder: Path) -> None:
+async def cancelled_while_driving(robot: FakeRobot, folder: Path) -> None:
     station = TeleopStation(cast(Robot, robot), Gamepad(folder))
     driving = asyncio.create_task(station.drive(take=True))
     await until(lambda: len(robot.steered) > 1)
@@ -207,18 +207,18 @@ async def cancelled_while_driving(robot: Held, folder: Path) -> None:
 async def test_a_station_that_a_signal_ends_stops_the_body_and_hands_it_back(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    robot = Held()
+    robot = FakeRobot()
     await cancelled_while_driving(robot, tmp_path)
     assert robot.steered[-1] == ZERO
-    assert robot.enabled == 2  # for the station, and for the brain again
+    assert robot.enabled == 2  # at the station's start, and for the brain at its end
 
 
-@pytest.mark.parametrize("stopped_by", ["this station", "somebody else"])
+@pytest.mark.parametrize("stopped_by", ["this station", "another station"])
 async def test_a_gamepad_held_through_an_estop_must_be_pressed_again(
     tmp_path: Path, stopped_by: str
 ) -> None:
     os.mkfifo(tmp_path / "js0")
-    robot, pad = Held(), Gamepad(tmp_path)
+    robot, pad = FakeRobot(), Gamepad(tmp_path)
     latched = replace(example(RobotState), gate=GateStatus(mode="latched"))
     with terminal() as screen, (tmp_path / "js0").open("wb", buffering=0) as kernel:
         driving = asyncio.create_task(TeleopStation(cast(Robot, robot), pad).drive(take=True))
@@ -252,7 +252,7 @@ def terminal() -> Iterator[int]:
         pytest.MonkeyPatch.context() as patch,
     ):
         patch.setenv("TERM", "xterm")
-        patch.setattr("rich._console", None)  # remembers what its output was
+        patch.setattr("rich._console", None)  # it would keep its former output
         patch.setattr("sys.stdin", typed)
         patch.setattr("sys.stdout", shown)
         yield screen
@@ -260,10 +260,10 @@ def terminal() -> Iterator[int]:
 
 
 @pytest.mark.parametrize("halt", ["Ctrl-S", "Scroll Lock"])
-async def test_the_space_bar_stops_while_the_terminal_takes_no_output(
+async def test_the_space_bar_stops_while_the_terminal_accepts_no_output(
     tmp_path: Path, halt: str
 ) -> None:
-    robot, resumed = Held(), threading.Event()
+    robot, resumed = FakeRobot(), threading.Event()
     station = TeleopStation(cast(Robot, robot), Gamepad(tmp_path))
     with terminal() as screen:
         driving = asyncio.create_task(station.drive(take=True))
@@ -292,12 +292,12 @@ async def test_the_space_bar_stops_while_the_terminal_takes_no_output(
     assert not resumed.is_set()
 
 
-async def test_an_arrow_that_arrives_byte_by_byte_is_no_letter() -> None:
+async def test_an_arrow_key_may_arrive_byte_by_byte() -> None:
     found: list[str] = []
     with terminal() as screen, typed_keys(lambda typed: found.extend(keys_of(typed))):
         for byte in b"\x1b[A\x1bw\x1b[1;5D ":
             os.write(screen, bytes((byte,)))
-            await asyncio.sleep(0.01)  # read before the next
+            await asyncio.sleep(0.01)  # until it is read
         await until(lambda: " " in found)
     assert found == ["up", "w", "left", " "]
 
@@ -308,7 +308,7 @@ async def test_a_station_that_cannot_return_the_body_reports_it_and_ends(
     def lost() -> None:
         raise BodyLost("robot/state has stopped")
 
-    await cancelled_while_driving(Held(lost), tmp_path)
+    await cancelled_while_driving(FakeRobot(lost), tmp_path)
     assert "cannot return the body" in capsys.readouterr().err
 
 
@@ -349,7 +349,7 @@ def test_the_right_shoulder_button_moves_joints_and_the_left_one_the_base() -> N
     assert pad.velocity(ARM, 0.5).linear_x == pytest.approx(0.13)
 
 
-def test_the_joints_are_shown_in_degrees_and_the_chosen_one_marked() -> None:
+def test_joints_are_shown_in_degrees_with_a_mark_at_the_chosen_one() -> None:
     state = replace(
         example(RobotState),
         joints=(Joint(name="pan", position=0.5), Joint(name="lift", position=-1)),

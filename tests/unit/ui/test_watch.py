@@ -1,4 +1,4 @@
-"""RunMonitor counts the way, repeats lost queries, and notices a brain that is held up by load."""
+"""RunMonitor measures the distance, repeats lost queries, and detects a brain delayed by load."""
 
 import asyncio
 import io
@@ -27,14 +27,14 @@ async def answer(_: DescribeRequest) -> Description:
     return Description(process="driver", pid=7, host="robot", version="1")
 
 
-async def test_a_process_that_returns_in_time_is_described() -> None:
+async def test_a_process_that_starts_in_time_is_described() -> None:
     net = Net()
     asking = asyncio.ensure_future(RunMonitor(net.one).describe("driver", 20.0))
     await asyncio.sleep(0.15)
     net.two.serve(DESCRIBE, answer, name="driver")
-    told = await asking
-    assert told
-    assert told.pid == 7
+    description = await asking
+    assert description
+    assert description.pid == 7
 
 
 async def test_a_process_that_never_answers_has_no_description() -> None:
@@ -56,8 +56,8 @@ async def test_a_brain_that_is_late_on_a_busy_machine_is_held_by_its_load(
     mode: GateMode, cause: str, warning: str, held: bool
 ) -> None:
     net = Net()
-    watch, said = RunMonitor(net.one), Cause(code=cause, text="why")
-    gate = GateStatus(mode=mode, causes=(said,), enables=1)
+    watch = RunMonitor(net.one)
+    gate = GateStatus(mode=mode, causes=(Cause(code=cause, text="why"),), enables=1)
     pose = Pose(x=0.0, y=0.0, yaw=0.0)
     net.two.publish(STATE, RobotState(robot_type="any", pose=pose, velocity=Velocity(), gate=gate))
     busy = Cause(code=warning, text="why")
@@ -79,10 +79,10 @@ async def test_only_the_row_of_safety_shows_its_verdict(process: str, activity: 
     assert _activity(process, watch) == activity
 
 
-async def test_each_look_adds_the_way_since_the_last_and_counts_turns_that_begin() -> None:
+async def test_each_look_adds_the_distance_since_the_last_and_counts_new_turns() -> None:
     net = Net()
     watch = RunMonitor(net.one)
-    watch.look()  # nothing has come
+    watch.look()  # before any message
     state = example(RobotState)
     for x, turn in ((0.0, 0.0), (0.3, 0.5), (0.7, 0.5), (0.7, 0.0), (0.7, 0.5)):
         net.two.publish(STATE, replace(state, pose=Pose(x=x, y=0.0, yaw=0.0)))
@@ -96,7 +96,7 @@ async def test_each_look_adds_the_way_since_the_last_and_counts_turns_that_begin
     assert watch.start_times.metre_s is None
 
 
-async def test_its_time_goes_on_over_a_new_start_of_the_driver() -> None:
+async def test_its_time_continues_when_the_driver_restarts() -> None:
     net = Net()
     watch = RunMonitor(net.one)
     for boot, tick, seconds in ((1, 100, 2.0), (1, 150, 3.0), (2, 1, 3.02), (2, 50, 4.0)):
@@ -117,11 +117,11 @@ def text_of(shown: RenderableType) -> str:
     return capture.get()
 
 
-def test_a_table_shows_names_as_they_are() -> None:
+def test_a_table_escapes_markup_and_control_characters() -> None:
     assert SHOWN in text_of(plain_table(("process",), [(NASTY,)], left=("process",)))
 
 
-async def test_the_view_of_a_demo_shows_a_reason_as_it_is(
+async def test_the_view_of_a_demo_escapes_markup_and_control_characters(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     net = Net()
