@@ -56,7 +56,7 @@ MAX_JOINTS = 128
 MAX_ARM_JOINTS = 32
 MAX_MODEL_CHARACTERS = 262_144
 MAX_KEEP_OUT = 16
-FOLLOW_SHARE = 0.06  # of a joint's range, allowed distance from its setpoint
+FOLLOW_SHARE = 0.06  # allowed distance of a joint from its setpoint, as a share of its range
 MIN_AREA = 1e-4  # [m2]
 MIN_SPEED = 0.001  # [m/s], [rad/s]
 
@@ -336,7 +336,7 @@ class BodyDescription(Record, frozen=True, kw_only=True):
     max_linear_deceleration: AccelerationLimit = 1.0  # [m/s2]
     max_angular_acceleration: AccelerationLimit = 3.0  # [rad/s2]
     wheel_separation: Annotated[float, Meta(ge=0.0, le=10.0)] = 0.0
-    # [m], from left to right; of omni wheels, to the next one
+    # [m], between left and right wheels; for omni wheels, between neighbours
     wheel_radius: Annotated[float, Meta(ge=0.0, le=2.0)] = 0.0  # [m]; 0: unknown, or no wheels
     max_rim_speed: SpeedLimit | None = None
     # [m/s], of a wheel of a differential or omni base; None: it reaches all maximum speeds at once

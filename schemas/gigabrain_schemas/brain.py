@@ -30,9 +30,9 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-FARTHEST_HIT = 1000.0  # [m]
+FARTHEST_HIT = 1000.0  # [m], maximum of |x| and of |y|
 Resolution = Annotated[float, Meta(ge=0.001, le=1.0)]  # [m] per cell
-Cells = Annotated[int, Meta(ge=0, le=100_000)]  # along one side
+Cells = Annotated[int, Meta(ge=0, le=100_000)]  # number along one side of a map
 Delay = Annotated[float, Meta(ge=0.0, le=10.0)]  # [s]
 
 
@@ -197,7 +197,7 @@ class JointTarget(Record, frozen=True, kw_only=True):
     position: JointPosition  # [rad] or [m]
 
 
-LONGEST_WINDOW_S = 3.0  # of a joint trajectory in an intent
+LONGEST_WINDOW_S = 3.0  # maximum duration of a joint trajectory in an intent
 
 
 class JointTrajectory(Record, frozen=True, kw_only=True):
@@ -310,7 +310,7 @@ class CmdVel(Message, frozen=True, kw_only=True):
 class JointCommand(Message, frozen=True, kw_only=True):
     """A command to the gate: positions and velocities of joints for the next tick.
 
-    With positions only, joints move there and stay. With velocities only, they keep them up.
+    With positions only, joints move there and stay. With velocities only, they keep moving.
     """
 
     name: Annotated[tuple[JointName, ...], Meta(min_length=1, max_length=MAX_ARM_JOINTS)]

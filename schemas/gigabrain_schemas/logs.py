@@ -28,7 +28,7 @@ What = Literal[
 class AuditRecord(Message, frozen=True, kw_only=True):
     """An audit entry. Its wall time is `stamp_ns`, its robot time `boot` and `tick`."""
 
-    process: Name  # that wrote the entry
+    process: Name  # writer of the entry
     what: What
     source: Name  # the person or process that acted
     ok: bool = True  # the request was accepted
@@ -64,8 +64,8 @@ class InputLog(Message, frozen=True, kw_only=True):
     """All inputs that a process used since its last InputLog, in the order of use.
 
     A busy process skips messages, and those on different keys arrive in any order. So only the
-    process knows the inputs of its outputs. The key WAITED stands for background work that is due,
-    FINISHED for work that counts as soon as it is finished.
+    process knows from which inputs it computed an output. The key WAITED stands for background work
+    that is due, FINISHED for work that counts as soon as it is finished.
     """
 
     began_ns: Count  # Unix time of the first entry, by the process's clock
@@ -87,6 +87,6 @@ class AcceptedRequest(Message, frozen=True, kw_only=True):
     It is an input like any message: `tick` and `basis` are those of the newest inputs.
     """
 
-    process: Name = ""  # that accepted it
+    process: Name = ""  # process that accepted the request
     service: Name  # key of the service, such as robot/goal
     request: Annotated[str, Meta(max_length=MAX_REQUEST_BYTES)]  # JSON, with its source

@@ -102,7 +102,8 @@ class DescribeRequest(Message, frozen=True, kw_only=True):
     """Ask a process for its description. The request may be empty."""
 
 
-# Checks if its name is free; works; has checked again for some seconds.
+# starting: checks that its name is free; working: its name is free; settled: it has checked again
+# for some seconds
 Claim = Literal["starting", "working", "settled"]
 
 

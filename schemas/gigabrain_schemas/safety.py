@@ -85,5 +85,5 @@ class LogRecord(Message, frozen=True, kw_only=True):
 class ButtonState(Message, frozen=True, kw_only=True):
     """State of an e-stop button. If a button is required, its silence counts as a press."""
 
-    pressed: bool  # also if the contact is unknown
+    pressed: bool  # also True if the contact is unknown
     text: Text = ""  # why it counts as pressed

@@ -42,8 +42,8 @@ class Thing(Record, frozen=True, kw_only=True):
 class SimScene(Message, frozen=True, kw_only=True):
     """The shapes of a simulated world, for viewers. The robot itself does not use them.
 
-    Body 0 does not move; the newest SimPoses of this version has the poses of the others. The body
-    of a thing has its name.
+    Body 0 does not move; the newest SimPoses of this version has the poses of the others. A thing
+    and its body have the same name.
     """
 
     version: Count  # number of changes

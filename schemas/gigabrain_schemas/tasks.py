@@ -18,7 +18,7 @@ from gigabrain_schemas.base import (
 from gigabrain_schemas.objects import TagId
 
 How = Literal["replace", "queue", "preempt"]
-# instead of all tasks; after them; or before them, which then go on
+# instead of all tasks; after them; or before them, and they continue afterwards
 TaskState = Literal["queued", "active", "paused", "succeeded", "failed", "cancelled"]
 MAX_REQUEST_BYTES = 96 * 1024  # of a request as text, with the longest mission
 MAX_POINTS = 256  # of a path that is only drawn

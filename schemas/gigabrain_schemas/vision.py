@@ -20,7 +20,7 @@ class DepthImage(Message, frozen=True, kw_only=True):
     """The depth of each pixel along the camera's axis [mm]; 0 is unknown. Compressed without loss.
 
     It has four planes, each with one pixel of every block of two by two pixels, in the order of
-    rows. So the first plane is the picture at half its width and height, for readers in a hurry.
+    rows. So the first plane is the picture at half its width and height, and is quicker to decode.
     A plane is uint16 by row, compressed by zlib.
     """
 

@@ -23,7 +23,7 @@ MAX_PLACES = 256
 Label = Annotated[str, Meta(pattern=r"^\w[\w .-]*$(?!\n)", max_length=64)]
 ZoneKind = Literal["keepout", "speed", "one_way"]
 Vertex = tuple[Coordinate, Coordinate]  # [m], in the map
-ZoneSpeed = Annotated[float, Meta(ge=0.05, le=100.0)]  # [m/s]; slower bodies seem stuck
+ZoneSpeed = Annotated[float, Meta(ge=0.05, le=100.0)]  # [m/s]; a slower body counts as stuck
 LaneWidth = Annotated[float, Meta(ge=0.05, le=100.0)]  # [m]
 
 

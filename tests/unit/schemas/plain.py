@@ -1,4 +1,4 @@
-"""Every message as a foreign client would build it, to be damaged in one place."""
+"""Example messages as plain maps, in which tests change one value."""
 
 from collections.abc import Iterator
 from typing import Any
@@ -15,12 +15,12 @@ def codec(name: str) -> Codec[Any]:
 
 
 def as_map(name: str) -> dict[str, Any]:
-    """The example as plain maps, lists and values."""
+    """Return the example of message `name` as plain maps, lists and values."""
     return hostile.as_map(type(EXAMPLES[name]))
 
 
 def maps(value: Any, path: Path = ()) -> Iterator[Path]:
-    """The way to every map of named fields."""
+    """Yield the path of every map of named fields."""
     if isinstance(value, dict):
         yield path
         for key, inner in value.items():
@@ -31,7 +31,7 @@ def maps(value: Any, path: Path = ()) -> Iterator[Path]:
 
 
 def numbers(name: str) -> list[Path]:
-    """The way to every number in message `name`."""
+    """Return the path of every number in message `name`."""
     return [
         path
         for path, value in leaves(as_map(name))
@@ -54,5 +54,5 @@ def refuses(name: str, payload: bytes) -> bool:
 
 
 def dotted(name: str, path: Path) -> str:
-    """`RobotState.joints.0.effort`."""
+    """Return a path as text, such as `RobotState.joints.0.effort`."""
     return ".".join((name, *map(str, path)))

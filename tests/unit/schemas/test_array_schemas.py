@@ -29,7 +29,7 @@ PIXELS = [
 
 @pytest.fixture(scope="module")
 def arrays(tmp_path_factory: pytest.TempPathFactory) -> dict[str, dict[str, Any]]:
-    """The properties that hold bytes, by message."""
+    """Return the properties that hold bytes, by message."""
     folder: Path = tmp_path_factory.mktemp("schemas")
     export(folder)
     found = {}
@@ -39,7 +39,7 @@ def arrays(tmp_path_factory: pytest.TempPathFactory) -> dict[str, dict[str, Any]
     return {name: properties for name, properties in found.items() if properties}
 
 
-def test_every_array_says_its_type_its_byte_order_and_its_shape(
+def test_every_array_has_its_type_byte_order_and_shape_in_its_schema(
     arrays: dict[str, dict[str, Any]],
 ) -> None:
     assert set(arrays) == {*OURS, "SimScene", "SimPoses"}
@@ -70,5 +70,5 @@ def test_an_array_is_read_by_its_schema(
     assert (values.dtype, values.shape) == (expected.dtype, expected.shape)
 
 
-def test_a_picture_that_is_compressed_is_no_array(arrays: dict[str, dict[str, Any]]) -> None:
+def test_a_compressed_picture_has_no_array_type(arrays: dict[str, dict[str, Any]]) -> None:
     assert arrays["Image"]["data"]["x-dtype"]["jpeg"] is None

@@ -74,12 +74,14 @@ def trajectory(name: tuple[str, ...], positions: bytes) -> JointTrajectory:
         (lambda: Thresholds(motor_warn=71.0), "motor_stop must not be below motor_warn"),
     ],
 )
-def test_lengths_and_limits_have_to_agree(build: Callable[[], Any], complaint: str) -> None:
+def test_contradicting_lengths_and_limits_are_refused(
+    build: Callable[[], Any], complaint: str
+) -> None:
     with pytest.raises(ValueError, match=complaint):
         build()
 
 
-def test_a_scan_may_hold_inf_and_nan_and_is_read_without_a_copy() -> None:
+def test_a_scan_may_contain_inf_and_nan_and_is_read_without_a_copy() -> None:
     message = EXAMPLES["LaserScan"]
     assert isinstance(message, LaserScan)
     view = message.ranges_m
@@ -112,7 +114,7 @@ def test_a_trajectory_point_is_a_short_array_on_the_wire() -> None:
     assert msgspec.json.decode(b"[0.5,1.0,0.0,0.0]", type=TrajectoryPoint).linear_x == 0.0
 
 
-def test_hits_travel_as_pairs() -> None:
+def test_hits_are_encoded_as_pairs() -> None:
     x, y = np.array([0.5, -1.25]), np.array([2.0, 0.25])
     world = WorldModel(scan_ok=True, obstacle_ahead=False, hits=arrays.hits_bytes(x, y))
     assert world.points().tolist() == [[0.5, 2.0], [-1.25, 0.25]]
@@ -120,13 +122,13 @@ def test_hits_travel_as_pairs() -> None:
         WorldModel(scan_ok=True, obstacle_ahead=False, hits=bytes(4))
 
 
-def test_hits_that_are_no_place_are_left_out() -> None:
+def test_hits_beyond_the_limit_or_not_finite_are_left_out() -> None:
     x, y = np.array([0.5, np.nan, np.inf, 1e30, 2.0]), np.array([1.0, 0.0, 0.0, 0.0, np.nan])
     world = WorldModel(scan_ok=True, obstacle_ahead=False, hits=arrays.hits_bytes(x, y))
     assert world.points().tolist() == [[0.5, 1.0]]
 
 
-def test_a_scan_gives_its_hits_in_the_sensors_frame() -> None:
+def test_a_scan_returns_its_hits_in_the_sensors_frame() -> None:
     values = np.array((1.0, np.inf, np.nan, 0.05, 2.0))
     one = scan(arrays.ranges_bytes(values), angle_increment=math.pi / 2)
     assert one.angles.tolist() == pytest.approx([0, math.pi / 2, math.pi, 1.5 * math.pi, math.tau])

@@ -1,4 +1,4 @@
-"""Every field of every message has a bound of its own."""
+"""Every field of every message has bounds."""
 
 from collections.abc import Iterator
 from typing import Any
@@ -14,7 +14,7 @@ from gigabrain_zenoh.qa.faults.hostile import as_map, replaced
 
 
 def fields(of: Any, where: str) -> Iterator[tuple[str, Any]]:
-    """The way to every value that a message may hold, and its type."""
+    """Yield the path and the type of every value that a message may contain."""
     if isinstance(of, inspect.StructType):
         for one in of.fields:
             yield from fields(one.type, f"{where}.{one.name}")

@@ -13,7 +13,7 @@ from gigabrain_zenoh.codec import Codec
 from gigabrain_zenoh.qa.faults.hostile import leaves, replaced
 from tests.unit.schemas.plain import as_map, at, codec, dotted, maps, numbers, refuses
 
-# numbers that may be null: nothing measured, nothing in the way, no limit, any yaw, no clock
+# numbers that may be null: not measured, no obstacle, no limit, any yaw, no clock
 NULLABLE = {
     "Body.description.max_rim_speed", "RobotState.link.late_ms",
     "Body.description.joints.0.follow", "Body.description.joints.1.follow",
@@ -32,13 +32,13 @@ NULLABLE = {
     "Description.report.distance_m", "Description.report.contacts",
     "Detections.tags.0.yaw_in_map",
 }  # fmt: skip
-WILL_DO_EMPTY = {
+MAY_BE_EMPTY = {
     "EstopRequest", "DescribeRequest", "AuditRequest", "AuditPage", "ParamRequest", "SimRequest",
     "TaskStatus", "Zones", "MapListRequest", "MapListReply", "ObjectMap",
     "Solids", "ArmPlan",
 }  # fmt: skip
-NEEDS_ONE = {"GoalRequest", "ZonesRequest", "ObjectsRequest"}  # of several fields
-REPORT = ("Description.report.distance_m", "Description.report.contacts")  # texts as well
+NEEDS_ONE = {"GoalRequest", "ZonesRequest", "ObjectsRequest"}  # one of several fields is required
+REPORT = ("Description.report.distance_m", "Description.report.contacts")  # may also be texts
 
 # maps whose keys are free, such as rates by key
 FREE = {"rejected", "received_hz", "sent_hz", "latency_ms", "counters", "data", "report"}
@@ -59,7 +59,7 @@ def test_unknown_fields_are_refused_at_every_depth(name: str) -> None:
 
 @by_name
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf, True, False, "0.3", None])
-def test_every_number_refuses_what_is_no_finite_number(name: str, bad: Any) -> None:
+def test_every_number_field_refuses_values_that_are_not_finite_numbers(name: str, bad: Any) -> None:
     for path in numbers(name):
         where = dotted(name, path)
         if (bad is None and where in NULLABLE) or (isinstance(bad, str) and where in REPORT):
@@ -68,7 +68,7 @@ def test_every_number_refuses_what_is_no_finite_number(name: str, bad: Any) -> N
         assert refuses(name, payload), where
 
 
-def test_null_is_taken_only_where_it_means_something() -> None:
+def test_null_is_accepted_only_where_it_has_a_meaning() -> None:
     nullable = {
         dotted(name, path)
         for name in EXAMPLES
@@ -79,7 +79,7 @@ def test_null_is_taken_only_where_it_means_something() -> None:
 
 
 @by_name
-def test_numbers_beyond_reason_are_refused(name: str) -> None:
+def test_huge_numbers_are_refused(name: str) -> None:
     for path in numbers(name):
         for bad in (1e300, -1e300):
             payload = msgspec.msgpack.encode(replaced(as_map(name), path, bad))
@@ -87,7 +87,7 @@ def test_numbers_beyond_reason_are_refused(name: str) -> None:
 
 
 @by_name
-def test_counts_refuse_fractions_and_what_is_below_zero(name: str) -> None:
+def test_counts_refuse_fractions_and_negative_numbers(name: str) -> None:
     whole = as_map(name)
     for path in numbers(name):
         if path[-1] in {"stamp_ns", "seq", "boot", "tick", "basis", "pid", "width", "height"}:
@@ -114,13 +114,11 @@ def test_bytes_behind_the_message_are_refused(name: str, trailing: bytes) -> Non
 @pytest.mark.long
 @by_name
 @given(payload=st.binary(max_size=300))
-def test_random_bytes_are_refused_that_do_not_spell_out_what_is_required(
-    name: str, payload: bytes
-) -> None:
+def test_random_bytes_without_the_required_fields_are_refused(name: str, payload: bytes) -> None:
     fields = msgspec.structs.fields(type(EXAMPLES[name]))
     required = [field.encode_name.encode() for field in fields if field.required]
-    assert bool(required) == (name not in WILL_DO_EMPTY | NEEDS_ONE)
-    assert refuses(name, b"{}") == (name not in WILL_DO_EMPTY)
+    assert bool(required) == (name not in MAY_BE_EMPTY | NEEDS_ONE)
+    assert refuses(name, b"{}") == (name not in MAY_BE_EMPTY)
     if not refuses(name, payload):
         assert all(word in payload for word in required)
 
@@ -128,7 +126,7 @@ def test_random_bytes_are_refused_that_do_not_spell_out_what_is_required(
 @pytest.mark.long
 @by_name
 @given(data=st.data())
-def test_a_damaged_message_is_refused_or_still_a_valid_one(name: str, data: st.DataObject) -> None:
+def test_a_damaged_message_is_refused_or_still_valid(name: str, data: st.DataObject) -> None:
     encode = data.draw(st.sampled_from((msgspec.msgpack.encode, msgspec.json.encode)))
     payload = bytearray(encode(EXAMPLES[name]))
     for _ in range(data.draw(st.integers(1, 4))):
@@ -137,27 +135,27 @@ def test_a_damaged_message_is_refused_or_still_a_valid_one(name: str, data: st.D
         message = codec(name).decode(bytes(payload))
     except ValueError:
         return
-    sent_on = msgspec.msgpack.encode(message)
-    values = [value for _, value in leaves(msgspec.msgpack.decode(sent_on))]
+    encoded = msgspec.msgpack.encode(message)
+    values = [value for _, value in leaves(msgspec.msgpack.decode(encoded))]
     assert all(math.isfinite(value) for value in values if isinstance(value, float))
-    codec(name).decode(sent_on)
+    codec(name).decode(encoded)
 
 
 @pytest.mark.parametrize("topic", TOPICS, ids=lambda topic: topic.key)
-def test_what_is_larger_than_its_topic_allows_is_not_even_decoded(topic: Topic[Any]) -> None:
+def test_a_message_larger_than_its_topic_allows_is_not_decoded(topic: Topic[Any]) -> None:
     decode = Codec(topic.type, topic.max_bytes).decode
     with pytest.raises(ValueError, match=f"^{topic.max_bytes + 1} bytes, at most"):
         decode(b"{" * (topic.max_bytes + 1))
-    most = 8 * 1024 * 1024 if topic in (MAP, SIM_SCENE) else 1024 * 1024
-    assert topic.max_bytes <= most
-    with pytest.raises(ValueError, match=rf"^{most + 1} bytes, at most"):
-        decode(b"\x80" * (most + 1))
+    limit = 8 * 1024 * 1024 if topic in (MAP, SIM_SCENE) else 1024 * 1024
+    assert topic.max_bytes <= limit
+    with pytest.raises(ValueError, match=rf"^{limit + 1} bytes, at most"):
+        decode(b"\x80" * (limit + 1))
 
 
-def test_an_oversized_message_that_would_be_valid_is_refused_all_the_same() -> None:
-    spacious = b'{"linear_x": 0.2' + b" " * 1100 + b"}"
+def test_an_oversized_message_is_refused_even_if_it_is_valid() -> None:
+    oversized = b'{"linear_x": 0.2' + b" " * 1100 + b"}"
     with pytest.raises(ValueError, match="at most 1024 are read"):
-        codec("CmdVel").decode(spacious)
+        codec("CmdVel").decode(oversized)
 
 
 @pytest.mark.parametrize(
@@ -186,7 +184,7 @@ def test_an_oversized_message_that_would_be_valid_is_refused_all_the_same() -> N
         b"[]", b"0.3", b'"linear_x"', b"null", b"", b" ", b"{", b"}",
     ],
 )  # fmt: skip
-def test_json_that_is_no_command_is_refused(payload: bytes) -> None:
+def test_json_that_is_not_a_command_is_refused(payload: bytes) -> None:
     assert refuses("CmdVel", payload)
 
 
@@ -203,21 +201,21 @@ def test_nesting_a_hundred_thousand_deep_is_refused(start: bytes) -> None:
     "payload",
     [
         b"\x80",  # an empty map
-        b"\xc1",  # what MessagePack never uses
+        b"\xc1",  # a byte that MessagePack never uses
         b"\xdf\xff\xff\xff\xff",  # a map of 4 billion entries
-        b"\x81\xa8linear_x\xdd\xff\xff\xff\xff",  # an array of as many
-        b"\x81\xa8linear_x\xc6\xff\xff\xff\xff",  # as many bytes
+        b"\x81\xa8linear_x\xdd\xff\xff\xff\xff",  # an array of 4 billion
+        b"\x81\xa8linear_x\xc6\xff\xff\xff\xff",  # 4 billion bytes
         b"\x81\xa8linear_x\xd7\xff\x00\x00\x00\x00\x00\x00\x00\x00",  # a timestamp
         b"\x81\x01\xcb\x3f\xe0\x00\x00\x00\x00\x00\x00",  # a number for a key
         b"\x81\xa8linear_\xff\x01",  # a key that is no text
         b"\x95\x00\x00\x00\x00\x00",  # an array instead of a map
     ],
 )
-def test_messagepack_that_is_no_command_is_refused(payload: bytes) -> None:
+def test_messagepack_that_is_not_a_command_is_refused(payload: bytes) -> None:
     assert refuses("CmdVel", payload)
 
 
-def test_of_a_field_that_comes_twice_both_must_be_valid_and_the_last_one_counts() -> None:
+def test_a_repeated_field_must_be_valid_twice_and_the_last_value_counts() -> None:
     assert codec("CmdVel").decode(b'{"linear_x": 0.3, "linear_x": 0.1}') == CmdVel(linear_x=0.1)
     assert refuses("CmdVel", b'{"linear_x": NaN, "linear_x": 0.1}')
     twice = b"\x82\xa8linear_x\x01\xa8linear_x\x02"
@@ -236,7 +234,7 @@ def test_a_person_may_send_a_speed_alone(payload: bytes) -> None:
     assert codec("CmdVel").decode(payload) == CmdVel(linear_x=0.2)
 
 
-def test_a_complaint_about_a_hostile_message_is_short() -> None:
+def test_the_error_for_a_hostile_message_is_short() -> None:
     payload = msgspec.json.encode({"x" * 900: 1})
     with pytest.raises(ValueError, match="unknown field") as caught:
         codec("CmdVel").decode(payload)
@@ -273,7 +271,5 @@ def test_a_complaint_about_a_hostile_message_is_short() -> None:
         ),
     ],
 )
-def test_lengths_that_do_not_agree_are_refused_on_the_wire(
-    name: str, field: str, value: Any
-) -> None:
+def test_contradicting_lengths_are_refused_on_the_wire(name: str, field: str, value: Any) -> None:
     assert refuses(name, msgspec.msgpack.encode({**as_map(name), field: value}))

@@ -15,7 +15,7 @@ from tests.unit.schemas.plain import as_map, codec, dotted, refuses
 
 HEADER = {"stamp_ns", "seq", "boot", "tick", "basis"}
 
-# what a client may leave out, beside the header, and still be understood
+# fields that a client must send; it may leave out all others
 REQUIRED: dict[str, set[str]] = {
     "LaserScan": {"angle_min", "angle_increment", "range_min", "range_max", "ranges"},
     "Imu": {"orientation", "angular_velocity", "linear_acceleration"},
@@ -84,7 +84,7 @@ REQUIRED: dict[str, set[str]] = {
     "Description": {"process", "pid", "host", "version"},
 }  # fmt: skip
 
-NEEDED = {  # one of several is needed, and the example has no other
+NEEDED = {  # one of several fields is required, and the example has only this one
     ("JointCommand", "position"), ("GoalRequest", "x"), ("GoalRequest", "y"),
     ("ZonesRequest", "zone"), ("ObjectsRequest", "ids"),
 }  # fmt: skip
@@ -92,7 +92,7 @@ NEEDED = {  # one of several is needed, and the example has no other
 by_name = pytest.mark.parametrize("name", sorted(EXAMPLES))
 
 
-def test_the_table_holds_the_keys_and_rates_of_the_design() -> None:
+def test_the_table_has_the_keys_and_rates_of_the_design() -> None:
     assert {topic.at("*"): (topic.type.__name__, topic.hz) for topic in TOPICS} == {
         "robot/scan": ("LaserScan", 10),
         "robot/imu": ("Imu", 100),
@@ -135,7 +135,7 @@ def test_the_table_holds_the_keys_and_rates_of_the_design() -> None:
     ]  # fmt: skip
 
 
-def test_a_value_stops_counting_after_so_many_missed_periods() -> None:
+def test_a_value_is_stale_after_the_allowed_number_of_missed_periods() -> None:
     assert {topic.key: topic.stale_after_ns for topic in TOPICS} == {
         "robot/scan": 250_000_000,
         "robot/imu": 50_000_000,
@@ -172,13 +172,13 @@ def test_a_value_stops_counting_after_so_many_missed_periods() -> None:
     }
 
 
-def test_no_stream_blocks_its_sender_and_only_what_stops_the_robot_goes_first() -> None:
+def test_no_stream_blocks_its_sender_and_only_stops_have_the_first_priority() -> None:
     assert {topic.congestion for topic in TOPICS} == {"drop"}
     urgent = {each.key for each in (*TOPICS, *SERVICES) if each.priority == "real_time"}
     assert urgent == {"robot/button", "robot/estop"}
 
 
-def test_every_message_has_an_example_in_which_every_field_is_used() -> None:
+def test_every_message_has_an_example_with_all_its_fields() -> None:
     assert {message.__name__ for message in messages()} == set(EXAMPLES) == set(REQUIRED)
     unused = {
         dotted(name, path)
@@ -186,7 +186,7 @@ def test_every_message_has_an_example_in_which_every_field_is_used() -> None:
         for path, value in leaves(as_map(name))
         if value is None
     }
-    not_ended = {  # errors are those of goals that have ended
+    not_ended = {  # only goals that ended have errors
         f"TaskStatus.{task}.{error}_error"
         for task in ("current", "queue.0")
         for error in ("position", "heading")
@@ -201,7 +201,7 @@ def test_every_message_has_an_example_in_which_every_field_is_used() -> None:
 
 
 @pytest.mark.parametrize("message", messages())
-def test_every_message_is_frozen_and_documented_and_carries_the_header(
+def test_every_message_is_frozen_and_documented_and_has_the_header(
     message: type[Message],
 ) -> None:
     assert message.__struct_config__.frozen
@@ -210,7 +210,7 @@ def test_every_message_is_frozen_and_documented_and_carries_the_header(
     assert set(message.__struct_fields__) >= HEADER
 
 
-def test_the_golden_folder_holds_the_examples_byte_for_byte() -> None:
+def test_the_golden_folder_contains_the_examples_byte_for_byte() -> None:
     stored = {path.name: path.read_bytes() for path in examples.FOLDER.iterdir()}
     assert stored == examples.files()
     assert len(stored) == 124
@@ -225,7 +225,7 @@ def test_golden_files_decode_to_the_example(name: str) -> None:
         assert msgspec.msgpack.encode(decoded) == msgspec.msgpack.encode(EXAMPLES[name])
 
 
-def test_writing_the_golden_files_removes_those_of_messages_that_are_gone(tmp_path: Path) -> None:
+def test_writing_the_golden_files_removes_those_of_removed_messages(tmp_path: Path) -> None:
     (tmp_path / "Gone.json").write_text("{}")
     examples.write(tmp_path)
     assert not (tmp_path / "Gone.json").exists()
@@ -261,13 +261,13 @@ def test_the_export_is_a_schema_per_message_and_two_tables(tmp_path: Path) -> No
 
 
 @by_name
-def test_a_person_may_leave_out_what_has_a_default_and_nothing_else(name: str) -> None:
+def test_only_fields_with_a_default_may_be_left_out(name: str) -> None:
     whole = as_map(name)
     for key in whole:
         rest = {k: v for k, v in whole.items() if k != key}
         expected = key in REQUIRED[name] or (name, key) in NEEDED
         assert refuses(name, msgspec.msgpack.encode(rest)) is expected, key
         assert refuses(name, msgspec.json.encode(rest)) is expected, key
-    least = {key: whole[key] for key in REQUIRED[name]}
+    minimal = {key: whole[key] for key in REQUIRED[name]}
     if name not in {one for one, _ in NEEDED}:
-        assert not refuses(name, msgspec.msgpack.encode(least))
+        assert not refuses(name, msgspec.msgpack.encode(minimal))

@@ -1,4 +1,4 @@
-"""A message declares its rights and its drawing with its topic; its example is a file."""
+"""A new topic declares its drawing in its own entry; the example of its message is a file."""
 
 from pathlib import Path
 
@@ -17,7 +17,7 @@ class Bell(Message, frozen=True, kw_only=True):
     volume: float = 0.0  # [dB]
 
 
-def test_a_new_topic_is_drawn_as_its_line_says(tmp_path: Path) -> None:
+def test_a_new_topic_is_plotted_if_its_entry_says_so(tmp_path: Path) -> None:
     (tmp_path / "Bell.json").write_text('{"volume": 60.5}')
     bell = example(Bell, tmp_path)
     assert bell == Bell(volume=60.5)
@@ -27,7 +27,7 @@ def test_a_new_topic_is_drawn_as_its_line_says(tmp_path: Path) -> None:
     assert not Drawer().draws(Topic("robot/bell", Bell, 1))
 
 
-def test_a_new_topic_of_a_known_kind_is_drawn_without_a_line_elsewhere() -> None:
+def test_a_new_topic_with_a_known_drawing_is_drawn_without_more_code() -> None:
     planned = Topic("robot/planned", Intent, 1, drawing="path")
     (path,) = Drawer().draw(planned, example(Intent))
     assert (path.topic, path.encoding) == ("/viz/path", "protobuf")
