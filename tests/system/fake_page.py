@@ -1,4 +1,4 @@
-"""A page in front of a robot that says all there is to say."""
+"""A page of a fake robot that publishes on all topics."""
 
 import asyncio
 import contextlib
@@ -57,11 +57,11 @@ from gigabrain_zenoh.testing.processes import free_port
 from gigabrain_zenoh.ui.page.server import run
 from tests.system.page import OPERATOR, VIEWER
 
-SIDE = 80  # cells of the map, of 0.05 m; its corner is at (-2, -2)
+SIDE_CELLS = 80  # of the map, 0.05 m each; its corner is at (-2, -2)
 
 
 def wall_ahead() -> LaserScan:
-    """The lidar of a Waffle, 0.064 m behind its middle, sees a wall 1.2 m ahead of that."""
+    """Return a Waffle's scan of a wall 1.2 m ahead; its lidar is 0.064 m behind its middle."""
     angles = np.radians(np.arange(-20, 21))
     return LaserScan(
         angle_min=float(angles[0]), angle_increment=math.radians(1.0), range_min=0.1, range_max=3.5,
@@ -98,7 +98,7 @@ class Fake:
         tokens.write_text(f'{{"operator": "{OPERATOR}", "viewer": "{VIEWER}"}}')
         values = {"port": free_port(), "tokens": str(tokens), "login": True} | config
         self.config = msgspec.convert(values, PageConfig)
-        self._said = 0
+        self._published = 0
         self.mode: GateMode = "enabled"
         self.goals: list[GoalRequest] = []
         self.changes: list[TaskRequest] = []
@@ -128,40 +128,42 @@ class Fake:
         self.changes.append(request)
         return TaskReply(ok=True, text="goal-7 is cancelled")
 
-    def say(self) -> None:
-        """All that is said again and again."""
+    def publish_repeatedly(self) -> None:
+        """Publish the topics that are published repeatedly."""
         state = EXAMPLES["RobotState"]
         assert isinstance(state, RobotState)
         gate = replace(state.gate, mode=self.mode, commander="control", causes=())
         state = replace(state, pose=Pose(x=1.0, y=1.0, yaw=0.0), gate=gate)
         self.robot.publish(STATE, state)
         self.robot.publish(POSE, PoseInMap(x=0.5, y=0.0, yaw=0.0, covariance=(0.0,) * 9))
-        thing = Obstacle(id=1, x=1.0, y=1.8, radius=0.3)  # so at (0.5, 0.8) in the map
+        thing = Obstacle(id=1, x=1.0, y=1.8, radius=0.3)  # at (0.5, 0.8) in the map
         wall = Obstacle(id=2, x=2.2, y=1.0, radius=0.45)
         world = WorldModel(
             scan_ok=True, obstacle_ahead=False, obstacles=(thing, wall), contours=CONTOURS
         )
-        self._said += 1
-        self.robot.publish(WORLD, world, basis=self._said)
+        self._published += 1
+        self.robot.publish(WORLD, world, basis=self._published)
         self.robot.publish(CAMERA, REAR, name="rear")
         person = DetectedObject(id=9, x=2.3, y=2.5, radius=0.2, label="person")  # (1.8, 1.5)
         self.robot.publish(PERCEIVED, Objects(objects=(person,)), name="people")
         self.robot.publish(SCAN, wall_ahead())
-        way = tuple(TrajectoryPoint(t=i / 10, x=i / 10, y=0.0, yaw=0.0) for i in range(11))
-        intent = Intent(trajectory=way, behaviour="navigate", reason="on its way to the kitchen")
+        trajectory = tuple(TrajectoryPoint(t=i / 10, x=i / 10, y=0.0, yaw=0.0) for i in range(11))
+        intent = Intent(
+            trajectory=trajectory, behaviour="navigate", reason="on its way to the kitchen"
+        )
         self.robot.publish(INTENT, intent)
 
-    def say_once(self) -> None:
+    def publish_once(self) -> None:
         """Publish the kept topics once: body, map, objects and task."""
         body = load_robot("turtlebot3_waffle").description()
         self.robot.publish(BODY, Body(description=body, link="sim"))
-        cells = np.zeros((SIDE, SIDE), np.int8)
+        cells = np.zeros((SIDE_CELLS, SIDE_CELLS), np.int8)
         cells[:, 10] = 100  # a wall at x = -1.5
         cells[60:, 40:] = -1
         self.robot.publish(
             MAP,
             OccupancyGrid(
-                resolution=0.05, width=SIDE, height=SIDE, origin_x=-2.0, origin_y=-2.0,
+                resolution=0.05, width=SIDE_CELLS, height=SIDE_CELLS, origin_x=-2.0, origin_y=-2.0,
                 cells=cells.tobytes(),
             ),
         )  # fmt: skip
@@ -176,17 +178,17 @@ async def serving(fake: Fake) -> AsyncIterator[None]:
     ready = asyncio.Event()
     server = asyncio.ensure_future(run(fake.config, fake.bus, ready.set))
 
-    async def talk() -> None:
+    async def publish() -> None:
         while True:
-            fake.say()
+            fake.publish_repeatedly()
             await asyncio.sleep(0.05)
 
-    fake.say_once()
-    talking = asyncio.ensure_future(talk())
+    fake.publish_once()
+    publishing = asyncio.ensure_future(publish())
     await ready.wait()
     try:
         yield
     finally:
-        for task in (talking, server):
+        for task in (publishing, server):
             task.cancel()
-        await asyncio.gather(talking, server, return_exceptions=True)
+        await asyncio.gather(publishing, server, return_exceptions=True)

@@ -1,4 +1,4 @@
-"""A robot with an operator page, a browser that looks at it, and a client that misbehaves."""
+"""A robot with an operator page, a browser that shows it, and a plain WebSocket client."""
 
 import contextlib
 import shutil
@@ -17,7 +17,7 @@ from gigabrain_zenoh.testing.waiting import until
 from gigabrain_zenoh.ui.page import frames
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
-# the first four as its sandbox, GPU and network are none of ours; the rest keep it from the network
+# no sandbox, no GPU, no QUIC, no first-run page; the rest keep it from using the network
 FLAGS = [
     "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-sync",
     "--disable-background-networking", "--disable-component-update",
@@ -31,7 +31,7 @@ needs_browser = pytest.mark.skipif(CHROMIUM is None, reason="there is no Chromiu
 
 
 class Robot:
-    """A simulated robot whose page wants a token."""
+    """A simulated robot whose page requires a token."""
 
     def __init__(self, home: Home, **values: object) -> None:
         tokens = home.folder / "tokens.json"
@@ -52,19 +52,19 @@ class Robot:
         return f"http://127.0.0.1:{self.port}"
 
     async def served(self) -> None:
-        """Wait until its page is there."""
+        """Wait until its page is served."""
         await until(lambda: listens(self.port), "the page is served")
 
 
 class Served(Protocol):
-    """Whoever serves a page."""
+    """A robot, real or fake, with a page."""
 
     @property
     def origin(self) -> str: ...
 
 
 class Browser:
-    """One Chromium; nothing that its pages do may fail, nor leave this machine."""
+    """One Chromium. Its faults are errors of its pages, and requests to other machines."""
 
     def __init__(self, context: BrowserContext, robot: Served) -> None:
         self._context, self._robot = context, robot
@@ -73,7 +73,7 @@ class Browser:
     async def open(
         self, token: str = OPERATOR, *, width: int = 1280, height: int = 800, before: str = ""
     ) -> Page:
-        """A page that has a connection; `before` is a script that runs ahead of its own."""
+        """Open a page and wait for its connection; the script `before` runs before its own."""
         page = await self._context.new_page()
         if before:
             await page.add_init_script(before)
@@ -96,8 +96,8 @@ class Browser:
         await self._context.route(f"**/{file}", lambda route: route.abort(), times=1)
 
     async def close_pages(self) -> None:
-        """Close what a test has opened; the browser stays."""
-        for page in self._context.pages[1:]:  # it ends with its last one
+        """Close all pages that a test opened."""
+        for page in self._context.pages[1:]:  # the browser ends with its last page
             await page.close()
         assert self.faults == []
 
@@ -114,12 +114,12 @@ async def browser(robot: Served, folder: Path) -> AsyncIterator[Browser]:
             executable_path=CHROMIUM,
             headless=True,
             args=FLAGS,
-            ignore_https_errors=robot.origin.startswith("https"),  # its certificate is its own
+            ignore_https_errors=robot.origin.startswith("https"),  # the certificate is self-signed
         )
         try:
-            made = Browser(context, robot)
-            yield made
-            assert made.faults == []
+            chromium = Browser(context, robot)
+            yield chromium
+            assert chromium.faults == []
         finally:
             await context.close()
 
@@ -128,7 +128,7 @@ async def browser(robot: Served, folder: Path) -> AsyncIterator[Browser]:
 async def client(
     robot: Robot, token: str = OPERATOR, origin: str | None = None
 ) -> AsyncIterator[ClientConnection]:
-    """A WebSocket of no browser."""
+    """Connect a WebSocket without a browser, and log in."""
     url = f"ws://127.0.0.1:{robot.port}/ws"
     async with connect(url, origin=origin or robot.origin, max_queue=None) as socket:  # type: ignore[arg-type]
         await socket.send(frames.as_json(frames.LOGIN, frames.Login(token=token)))

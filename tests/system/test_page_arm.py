@@ -32,43 +32,43 @@ pytestmark = [needs_browser, pytest.mark.asyncio(loop_scope="module")]
 MODEL = (ROOT / "drivers/gigabrain_drivers/bodies/so101/model.xml").read_text("utf-8")
 ARM = load_robot("so101").description()
 SLIDER = replace(ARM.joints[-1], unit="m", lower=0.0, upper=0.04)
-CRANE = replace(ARM, joints=(*ARM.joints[:-1], SLIDER))  # its gripper slides
+CRANE = replace(ARM, joints=(*ARM.joints[:-1], SLIDER))  # with a sliding gripper
 DRIVES = replace(
     ARM, robot_type="mobile", drive_type="omni", max_linear_speed=0.3, max_lateral_speed=0.3,
     max_angular_speed=1.0,
 )  # fmt: skip
 READY = GateStatus(mode="enabled", commander="control", enables=1)
 LATCHED = GateStatus(mode="latched", estop_generation=1, enables=1)
-LOOKS = 300
+MAX_SCREENSHOTS = 300
 Colour = NDArray[np.float64]  # of each pixel, 0 to 255
 PAN = "shoulder_pan up: hold to move it"
 
 
 class FakeArm(Fake):
-    """An arm without a simulation, whose driver says what a test wants."""
+    """An arm without a simulation; the test sets the state that its driver publishes."""
 
     def __init__(self, folder: Path) -> None:
         super().__init__(folder)
         self.body: BodyDescription = CRANE
         self.gate, self.limp = READY, False
         self.jogged: list[JointSpeeds] = []
-        self.asked: list[bool] = []  # requests to let go, and to hold
+        self.limp_requests: list[bool] = []  # True: go limp; False: hold
         self.robot.serve(LIMP, self._let_go)
         self.robot.subscribe(JOINT_TELEOP, lambda _key, speeds: self.jogged.append(speeds))
 
     def become(self, body: BodyDescription = CRANE, gate: GateStatus = READY) -> None:
-        """Be another robot; forget what was wanted of the last."""
+        """Become another robot, and forget the commands to the last one."""
         self.body, self.gate, self.limp = body, gate, False
         self.jogged.clear()
-        self.asked.clear()
-        self.say_once()
+        self.limp_requests.clear()
+        self.publish_once()
 
     async def _let_go(self, request: LimpRequest) -> GateReply:
-        self.asked.append(request.limp)
+        self.limp_requests.append(request.limp)
         self.limp = request.limp
         return replace(example(GateReply), text="all joints are let go of")
 
-    def say(self) -> None:
+    def publish_repeatedly(self) -> None:
         first, *others, last = self.body.joints
         middle = [Joint(name=joint.name, position=0.1) for joint in others]
         measured = (
@@ -86,35 +86,35 @@ class FakeArm(Fake):
             ),
         )  # fmt: skip
 
-    def say_once(self) -> None:
+    def publish_once(self) -> None:
         self.robot.publish(BODY, Body(description=self.body, link="real"))
         self.robot.publish(ARM_MODEL, ArmModel(mjcf=MODEL))
 
     @property
     def wanted(self) -> dict[str, float]:
-        """The newest speeds that were asked for."""
+        """The newest commanded speeds."""
         if not self.jogged:
             return {}
         return dict(zip(self.jogged[-1].name, self.jogged[-1].velocity, strict=True))
 
     async def rests(self) -> None:
-        """Wait for the end of the stream."""
-        await until(lambda: self.wanted and not any(self.wanted.values()), "a last word")
+        """Wait for zero speeds at the end of the stream."""
+        await until(lambda: self.wanted and not any(self.wanted.values()), "zero speeds")
 
 
 @pytest_asyncio.fixture(loop_scope="module", scope="module")
 async def fake(tmp_path_factory: pytest.TempPathFactory) -> AsyncIterator[FakeArm]:
-    made = FakeArm(tmp_path_factory.mktemp("fake"))
-    async with serving(made):
-        yield made
+    fake = FakeArm(tmp_path_factory.mktemp("fake"))
+    async with serving(fake):
+        yield fake
 
 
 @pytest_asyncio.fixture(loop_scope="module", scope="module")
 async def started(
     fake: FakeArm, tmp_path_factory: pytest.TempPathFactory
 ) -> AsyncIterator[Browser]:
-    async with browser(fake, tmp_path_factory.mktemp("profile")) as made:
-        yield made
+    async with browser(fake, tmp_path_factory.mktemp("profile")) as chromium:
+        yield chromium
 
 
 @pytest_asyncio.fixture(loop_scope="module")
@@ -160,7 +160,7 @@ async def test_each_joint_is_shown_in_its_range(chromium: Browser) -> None:
     assert await page.inner_text("#tool-place") == f"tool at {place} cm, {down:.0f}° down"
 
 
-async def test_of_an_arm_alone_no_map_and_no_joystick_are_shown(
+async def test_an_arm_without_a_base_has_no_map_and_no_joystick(
     chromium: Browser, fake: FakeArm
 ) -> None:
     page = await opened(chromium)
@@ -178,14 +178,14 @@ async def test_of_an_arm_alone_no_map_and_no_joystick_are_shown(
     assert await page.is_visible("#edit-zones")
 
 
-async def test_a_joint_moves_while_its_button_is_held_and_at_the_speed_chosen(
+async def test_a_joint_moves_at_the_chosen_speed_while_its_button_is_held(
     chromium: Browser, fake: FakeArm
 ) -> None:
     page = await opened(chromium)
     await hold(page, fake)
     assert fake.wanted == pytest.approx({"shoulder_pan": 0.6})  # a fifth of 3 rad/s
     await page.wait_for_selector("#arm-status:has-text('shoulder_pan 34.4°/s')")
-    await page.mouse.move(5, 5)  # a pointer that slips off still holds it
+    await page.mouse.move(5, 5)  # the button stays held when the pointer leaves it
     count = len(fake.jogged)
     await until(lambda: len(fake.jogged) > count + 3, "more speeds")
     await page.mouse.up()
@@ -222,7 +222,7 @@ async def test_the_enter_key_holds_a_button_as_well(chromium: Browser, fake: Fak
 
 
 @pytest.mark.parametrize("end", ["blur", "hidden", "e-stop", "latched", "closed", "cancelled"])
-async def test_whatever_ends_a_hold_stops_the_joint(
+async def test_every_end_of_a_hold_stops_the_joint(
     chromium: Browser, fake: FakeArm, end: str
 ) -> None:
     page = await opened(chromium)
@@ -251,7 +251,7 @@ async def test_whatever_ends_a_hold_stops_the_joint(
         await page.mouse.up()
 
 
-async def test_its_buttons_stay_where_they_are_when_it_stops(
+async def test_its_buttons_keep_their_places_when_it_stops(
     chromium: Browser, fake: FakeArm
 ) -> None:
     page = await opened(chromium)
@@ -267,7 +267,7 @@ async def test_its_buttons_stay_where_they_are_when_it_stops(
     assert await button.bounding_box() == before
 
 
-async def test_an_arm_that_is_limp_says_so(chromium: Browser, fake: FakeArm) -> None:
+async def test_a_limp_arm_is_shown_as_limp(chromium: Browser, fake: FakeArm) -> None:
     fake.gate, fake.limp = LATCHED, True
     page = await opened(chromium)
     await page.wait_for_selector("#arm-status:has-text('limp: let go of')")
@@ -279,7 +279,7 @@ async def test_an_arm_that_is_limp_says_so(chromium: Browser, fake: FakeArm) -> 
     assert not fake.jogged
 
 
-async def test_an_arm_is_let_go_of_once_a_person_agrees_and_held_again(
+async def test_an_arm_goes_limp_after_a_confirmation_and_is_held_again(
     chromium: Browser, fake: FakeArm
 ) -> None:
     fake.gate = LATCHED
@@ -287,23 +287,23 @@ async def test_an_arm_is_let_go_of_once_a_person_agrees_and_held_again(
     assert await page.is_disabled("#arm-hold")
     await page.click("#arm-limp")
     await page.wait_for_selector("#let-go:has-text('may fall')", state="visible")
-    await page.keyboard.press("Enter")  # the answer that has the focus keeps it
+    await page.keyboard.press("Enter")  # “no” has the focus
     await page.wait_for_selector("#let-go", state="hidden")
-    assert not fake.asked
+    assert not fake.limp_requests
     await page.click("#arm-limp")
-    await page.click("#estop")  # which stays within reach
+    await page.click("#estop")  # it works during the question
     await page.wait_for_selector('#confirmed:has-text("CONFIRMED by")')
     await page.click("#let-go-yes")
     await page.wait_for_selector("#reply:has-text('all joints are let go of')")
     await page.wait_for_selector("#arm-status:has-text('“Hold” holds it')")
-    assert fake.asked == [True]
+    assert fake.limp_requests == [True]
     assert await page.is_disabled("#arm-limp")
     await page.click("#arm-hold")
     await page.wait_for_selector("#arm-status:has-text('held')")
-    assert fake.asked == [True, False]
+    assert fake.limp_requests == [True, False]
 
 
-async def test_a_moving_arm_is_held_and_not_let_go_of(chromium: Browser, fake: FakeArm) -> None:
+async def test_an_enabled_arm_can_be_held_but_not_go_limp(chromium: Browser, fake: FakeArm) -> None:
     page = await opened(chromium)
     assert await page.is_disabled("#arm-limp")
     assert await page.get_attribute("#arm-limp", "title") == "Press STOP first"
@@ -311,15 +311,15 @@ async def test_a_moving_arm_is_held_and_not_let_go_of(chromium: Browser, fake: F
     await page.wait_for_selector("#reply:has-text('held until the brain is let drive again')")
     await until(lambda: fake.wanted, "speeds of joints")
     assert fake.wanted == dict.fromkeys((joint.name for joint in CRANE.joints), 0.0)
-    assert not fake.asked
+    assert not fake.limp_requests
     fake.gate = LATCHED
     await page.click("#arm-limp")
     await page.wait_for_selector("#let-go", state="visible")
-    fake.gate = READY  # which takes the question away
+    fake.gate = READY  # this closes the question
     await page.wait_for_selector("#let-go", state="hidden")
 
 
-async def test_of_two_operators_one_moves_the_arm(chromium: Browser, fake: FakeArm) -> None:
+async def test_only_one_of_two_operators_moves_the_arm(chromium: Browser, fake: FakeArm) -> None:
     one, two = await opened(chromium), await opened(chromium)
     await hold(one, fake)
     await two.get_by_label(PAN.replace("up", "down")).focus()
@@ -347,24 +347,24 @@ async def test_the_arm_is_drawn_in_three_dimensions(chromium: Browser) -> None:
 
 
 @pytest.mark.slow
-async def test_the_way_of_the_tool_and_the_grasps_are_drawn_for_those_who_look(
+async def test_the_path_of_the_tool_and_the_grasps_are_drawn_for_viewers(
     chromium: Browser, fake: FakeArm
 ) -> None:
-    await until(lambda: ARM_PLAN.key not in fake.bus.listens, "nobody to look")
+    await until(lambda: ARM_PLAN.key not in fake.bus.listens, "no viewer to subscribe")
     page = await opened(chromium)
-    await until(lambda: ARM_PLAN.key in fake.bus.listens, "the page to look")
-    way = np.linspace((0.1, -0.25, 0.3), (0.25, -0.15, 0.02), 30, dtype="<f4")
+    await until(lambda: ARM_PLAN.key in fake.bus.listens, "the page to subscribe")
+    path = np.linspace((0.1, -0.25, 0.3), (0.25, -0.15, 0.02), 30, dtype="<f4")
     grasps = [
         GraspPose(position=place, orientation=(0.0, 0.7071068, 0.0, 0.7071068), opening=0.03)
         for place in ((0.25, -0.15, 0.02), (0.2, -0.25, 0.02))
     ]
-    fake.robot.publish(ARM_PLAN, ArmPlan(path=way.tobytes(), grasps=tuple(grasps)))
-    await drawn(page, is_blue, 60)  # the way is blue
-    await drawn(page, is_green, 20)  # the grasp that is chosen is green
-    late = await opened(chromium)  # what is kept is shown to those who come later
+    fake.robot.publish(ARM_PLAN, ArmPlan(path=path.tobytes(), grasps=tuple(grasps)))
+    await drawn(page, is_blue, 60)  # the path is blue
+    await drawn(page, is_green, 20)  # the chosen grasp is green
+    late = await opened(chromium)  # a later viewer gets the kept plan
     await drawn(late, is_blue, 60)
     fake.robot.publish(ARM_PLAN, ArmPlan())
-    await drawn(page, is_blue, 0, most=0)
+    await drawn(page, is_blue, 0, maximum=0)
 
 
 def is_blue(r: Colour, g: Colour, b: Colour) -> Any:
@@ -376,19 +376,19 @@ def is_green(r: Colour, g: Colour, b: Colour) -> Any:
 
 
 async def drawn(
-    page: Page, colour: Callable[..., Any], least: int, most: int = sys.maxsize
+    page: Page, colour: Callable[..., Any], minimum: int, maximum: int = sys.maxsize
 ) -> None:
-    """Wait until so many pixels of the world have a colour: a condition on r, g and b.
+    """Wait until the right number of pixels fulfils `colour`, a condition on r, g and b.
 
-    It looks at screenshots: the canvas itself is empty again once the browser has shown it.
+    It uses screenshots, as the canvas itself is empty after the browser has shown it.
     """
     count = -1
-    for _ in range(LOOKS):
+    for _ in range(MAX_SCREENSHOTS):
         data = await page.locator("#world").screenshot()
         shown = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR).astype(float)
         b, g, r = np.moveaxis(shown, -1, 0)
         count = np.count_nonzero(colour(r, g, b))
-        if least <= count <= most:
+        if minimum <= count <= maximum:
             return
         await asyncio.sleep(0.1)
-    raise AssertionError(f"{count} pixels have the colour, not {least} to {most}")
+    raise AssertionError(f"{count} pixels have the colour, not {minimum} to {maximum}")

@@ -1,4 +1,4 @@
-"""Cameras on the page: pictures with what is recognised, contours, and things."""
+"""Cameras on the page: pictures with detections, contours, and things."""
 
 import asyncio
 from collections.abc import AsyncIterator
@@ -28,15 +28,15 @@ PIXELS = """([camera, at]) => {
 
 @pytest_asyncio.fixture(loop_scope="module", scope="module")
 async def fake(tmp_path_factory: pytest.TempPathFactory) -> AsyncIterator[Fake]:
-    made = Fake(tmp_path_factory.mktemp("fake"))
-    async with serving(made):
-        yield made
+    fake = Fake(tmp_path_factory.mktemp("fake"))
+    async with serving(fake):
+        yield fake
 
 
 @pytest_asyncio.fixture(loop_scope="module", scope="module")
 async def started(fake: Fake, tmp_path_factory: pytest.TempPathFactory) -> AsyncIterator[Browser]:
-    async with browser(fake, tmp_path_factory.mktemp("profile")) as made:
-        yield made
+    async with browser(fake, tmp_path_factory.mktemp("profile")) as chromium:
+        yield chromium
 
 
 @pytest_asyncio.fixture(loop_scope="module")
@@ -46,13 +46,13 @@ async def chromium(started: Browser) -> AsyncIterator[Browser]:
 
 
 def jpeg(value: int = 200, *, end: int | None = None) -> Image:
-    """Return a grey picture of 32 x 16 pixels; cut off after `end` bytes."""
+    """Return a grey JPEG of 32 x 16 pixels, cut off after `end` bytes if it is set."""
     data = cv2.imencode(".jpg", np.full((16, 32, 3), value, np.uint8))[1].tobytes()
     return Image(frame_id="front", encoding="jpeg", width=32, height=16, data=data[:end])
 
 
 async def shown(fake: Fake, page: Page, camera: str, picture: Image, values: list[int]) -> None:
-    """Publish a picture, again and again, until the page shows these pixels first."""
+    """Publish a picture repeatedly until the page shows these values as its first pixels."""
     for _ in range(300):
         fake.robot.publish(IMAGE, picture, name=camera)
         await asyncio.sleep(0.1)
@@ -65,7 +65,9 @@ async def shown(fake: Fake, page: Page, camera: str, picture: Image, values: lis
 
 async def test_pictures_of_cameras_are_drawn(chromium: Browser, fake: Fake) -> None:
     page = await chromium.open()
-    await page.wait_for_selector("#show-cameras[aria-pressed=true]")  # where there is room
+    await page.wait_for_selector(
+        "#show-cameras[aria-pressed=true]"
+    )  # open by default on a wide page
     grey = Image(frame_id="cam", encoding="mono8", height=1, width=2, data=b"\x00\xff")
     rgb = Image(frame_id="cam", encoding="rgb8", height=1, width=1, data=b"\x0a\x14\x1e")
     await shown(fake, page, "front", grey, [0, 0, 0, 255, 255, 255, 255, 255])
@@ -75,12 +77,12 @@ async def test_pictures_of_cameras_are_drawn(chromium: Browser, fake: Fake) -> N
     assert names == ["front", "left", "rear"]
 
 
-async def test_a_camera_with_a_problem_says_which(chromium: Browser) -> None:
+async def test_the_problem_of_a_camera_is_shown(chromium: Browser) -> None:
     page = await chromium.open()
     await page.wait_for_selector('#pictures [data-camera="rear"] [role=status]:has-text("covered")')
 
 
-async def test_a_broken_picture_is_named_and_the_next_one_shown(
+async def test_a_broken_picture_is_reported_and_the_next_one_shown(
     chromium: Browser, fake: Fake
 ) -> None:
     page = await chromium.open()
@@ -89,9 +91,9 @@ async def test_a_broken_picture_is_named_and_the_next_one_shown(
     bomb = bytearray(jpeg().data)
     at = bomb.index(b"\xff\xc0")
     bomb[at + 5 : at + 9] = b"\xff\xdc\xff\xdc"
-    claims = Image(frame_id="front", encoding="jpeg", width=32, height=16, data=bytes(bomb))
+    bomb_image = Image(frame_id="front", encoding="jpeg", width=32, height=16, data=bytes(bomb))
     for _ in range(100):
-        fake.robot.publish(IMAGE, claims, name="front")
+        fake.robot.publish(IMAGE, bomb_image, name="front")
         await asyncio.sleep(0.1)
         if "65500 x 65500" in await page.inner_text(figure):
             break
@@ -111,7 +113,7 @@ async def test_boxes_are_drawn_over_the_picture_and_can_be_switched_off(
     found = Detections(camera="front", width=32, height=16, things=(can,))
 
     async def overlay() -> int:
-        """Say it again; return how many pixels are drawn."""
+        """Publish the detections; return the number of drawn pixels."""
         fake.robot.publish(DETECTIONS, found)
         await asyncio.sleep(0.15)
         return sum(alpha > 0 for alpha in (await page.evaluate(PIXELS, ["front", 1]))[3::4])
@@ -125,7 +127,7 @@ async def test_boxes_are_drawn_over_the_picture_and_can_be_switched_off(
     await page.click("#show-boxes")
     assert await overlay() == 0
     fake.presses.clear()
-    await page.keyboard.press("Space")  # stops, whatever has the focus
+    await page.keyboard.press("Space")  # it stops, although a button has the focus
     await until(lambda: fake.presses == ["page"], "an e-stop")
     assert await overlay() == 0
 
@@ -206,11 +208,11 @@ async def test_a_click_on_a_thing_offers_to_go_there(chromium: Browser, fake: Fa
     assert goal.y is not None
     assert goal.yaw is not None
     away = np.hypot(goal.x, goal.y + 1.0)
-    assert 0.3 < away < 1.0  # beside it, for there are two cans
+    assert 0.3 < away < 1.0  # a pose beside it, as there are two cans
     assert goal.yaw == pytest.approx(np.arctan2(-1.0 - goal.y, -goal.x), abs=0.01)  # facing it
 
 
-async def test_the_only_one_of_its_class_and_a_tag_are_named_to_decision(
+async def test_goals_at_a_unique_thing_or_a_tag_are_sent_by_name(
     chromium: Browser, fake: Fake
 ) -> None:
     page = await chromium.open()

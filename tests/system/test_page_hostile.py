@@ -1,4 +1,4 @@
-"""Hostile WebSocket clients of the page's server: they are cut off and move nothing."""
+"""Hostile WebSocket clients of the page's server are disconnected, and move nothing."""
 
 import asyncio
 import contextlib
@@ -27,25 +27,25 @@ ESTOP = frames.as_json(frames.ASK, {"id": 1, "what": "estop"})
 
 @pytest.fixture(scope="module")
 def robot(shared_home: Home) -> Iterator[Robot]:
-    made = Robot(shared_home)
-    yield made
-    made.command.close()
+    robot = Robot(shared_home)
+    yield robot
+    robot.command.close()
 
 
-async def kinds(robot: Robot, token: str = OPERATOR) -> int:
-    """The kind of the first frame that a newcomer gets."""
+async def first_frame_kind(robot: Robot, token: str = OPERATOR) -> int:
+    """Return the kind of the first frame that a new client receives."""
     async with client(robot, token) as socket:
         frame = await asyncio.wait_for(socket.recv(), 20)
         assert isinstance(frame, bytes)
         return frame[0]
 
 
-async def hear_on(socket: ClientConnection) -> None:
+async def receive_all(socket: ClientConnection) -> None:
     while True:
         await asyncio.wait_for(socket.recv(), 20)
 
 
-async def pour(socket: ClientConnection) -> None:
+async def send_endlessly(socket: ClientConnection) -> None:
     while True:
         await socket.send(REST)
         await asyncio.sleep(0)
@@ -90,7 +90,7 @@ async def served(robot: Robot) -> None:
         "stop",
     ],
 )
-async def test_what_no_page_of_ours_sends_ends_the_connection_and_moves_nothing(
+async def test_a_frame_that_the_page_never_sends_ends_the_connection_and_moves_nothing(
     robot: Robot, token: str, frame: bytes
 ) -> None:
     async with probing(robot.endpoint) as seen:
@@ -101,18 +101,18 @@ async def test_what_no_page_of_ours_sends_ends_the_connection_and_moves_nothing(
         async with client(robot, token) as socket:
             await socket.send(frame)
             with pytest.raises(ConnectionClosed):
-                await hear_on(socket)
+                await receive_all(socket)
         await seen.ticks(10)
         assert steered == []
         assert seen.state.gate.estop_generation == generation
-    assert await kinds(robot) == frames.ABOUT
+    assert await first_frame_kind(robot) == frames.ABOUT
 
 
 @pytest.mark.usefixtures("served")
-async def test_a_flood_is_cut_off_and_others_go_on(robot: Robot) -> None:
+async def test_a_flooding_client_is_disconnected_and_others_are_served(robot: Robot) -> None:
     async with client(robot, VIEWER) as other, client(robot) as flood:
         with pytest.raises(ConnectionClosed):
-            await pour(flood)
+            await send_endlessly(flood)
         assert await asyncio.wait_for(other.recv(), 20)
 
 
@@ -124,7 +124,7 @@ async def test_a_flood_is_cut_off_and_others_go_on(robot: Robot) -> None:
         pytest.param(b"GET / HTTP/1.1\r\nHost: ", id="half", marks=pytest.mark.slow),
     ],
 )
-async def test_silent_connections_keep_no_browser_out(robot: Robot, begun: bytes) -> None:
+async def test_browsers_can_connect_beside_silent_connections(robot: Robot, begun: bytes) -> None:
     with contextlib.ExitStack() as stack:
         for _ in range(100):
             silent = socket.create_connection(("127.0.0.1", robot.port), timeout=20)
@@ -133,23 +133,23 @@ async def test_silent_connections_keep_no_browser_out(robot: Robot, begun: bytes
         assert page.status == 200
         page.close()
         silent.settimeout(30)
-        assert await asyncio.to_thread(silent.recv, 1) == b""  # the last one is hung up on as well
+        assert await asyncio.to_thread(silent.recv, 1) == b""  # the last one is closed as well
 
 
 @pytest.mark.usefixtures("served")
-async def test_only_its_own_pages_with_a_token_are_let_in(robot: Robot) -> None:
+async def test_only_its_own_pages_with_a_token_may_connect(robot: Robot) -> None:
     with pytest.raises(InvalidStatus):
         async with client(robot, origin="http://evil.example"):
             pass
     with pytest.raises(ConnectionClosed) as closed:
-        await kinds(robot, "a guess")
+        await first_frame_kind(robot, "a guess")
     assert closed.value.rcvd
     assert closed.value.rcvd.code == 4401
 
 
 @pytest.mark.usefixtures("served")
-async def test_a_page_asked_for_by_another_name_is_not_given(robot: Robot) -> None:
-    """DNS rebinding: another site's name that leads to this address."""
+async def test_a_request_with_another_host_name_is_refused(robot: Robot) -> None:
+    """It prevents DNS rebinding, in which another site's name resolves to this address."""
     reader, writer = await asyncio.open_connection("127.0.0.1", robot.port)
     writer.write(b"GET / HTTP/1.1\r\nHost: evil.example\r\nConnection: close\r\n\r\n")
     assert b" 421 " in await reader.readline()
@@ -177,7 +177,7 @@ async def test_a_viewer_that_never_reads_slows_neither_robot_nor_others(robot: R
             frame = await asyncio.wait_for(other.recv(), 20)
             states += frame[0] == frames.STATE
         assert seen.state.boot != 0
-        await until(lambda: seen.state.tick - begin >= 200, "the robot's time goes on as well")
+        await until(lambda: seen.state.tick - begin >= 200, "the robot's time advances as well")
     writer.close()
 
 
@@ -187,12 +187,14 @@ async def test_a_demo_prints_the_address_of_its_page_and_avoids_a_taken_port(
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
         demo = home.start(*AVOID, "--headless", "--page", "--port", str(port))
-        await until(lambda: "operator page: http://127.0.0.1:" in demo.err, "it says where")
-        said = re.search(r"http://127\.0\.0\.1:(\d+)\n", demo.err)
-        assert said
-        assert int(said[1]) != port
-        reader, writer = await asyncio.open_connection("127.0.0.1", int(said[1]))
-        writer.write(f"GET / HTTP/1.1\r\nHost: 127.0.0.1:{said[1]}\r\n\r\n".encode())
+        await until(
+            lambda: "operator page: http://127.0.0.1:" in demo.err, "the address of the page"
+        )
+        address = re.search(r"http://127\.0\.0\.1:(\d+)\n", demo.err)
+        assert address
+        assert int(address[1]) != port
+        reader, writer = await asyncio.open_connection("127.0.0.1", int(address[1]))
+        writer.write(f"GET / HTTP/1.1\r\nHost: 127.0.0.1:{address[1]}\r\n\r\n".encode())
         assert b" 200 " in await reader.readline()
         writer.close()
         demo.send(signal.SIGINT)

@@ -62,15 +62,15 @@ MOVE_STICK_LEFT = """() => {
 
 @pytest_asyncio.fixture(loop_scope="module", scope="module")
 async def fake(tmp_path_factory: pytest.TempPathFactory) -> AsyncIterator[Fake]:
-    made = Fake(tmp_path_factory.mktemp("fake"))
-    async with serving(made):
-        yield made
+    fake = Fake(tmp_path_factory.mktemp("fake"))
+    async with serving(fake):
+        yield fake
 
 
 @pytest_asyncio.fixture(loop_scope="module", scope="module")
 async def chromium(fake: Fake, tmp_path_factory: pytest.TempPathFactory) -> AsyncIterator[Browser]:
-    async with browser(fake, tmp_path_factory.mktemp("profile")) as made:
-        yield made
+    async with browser(fake, tmp_path_factory.mktemp("profile")) as chromium:
+        yield chromium
 
 
 async def colour(page: Page, x: float, y: float) -> tuple[int, ...]:
@@ -117,7 +117,9 @@ def violet(pixel: tuple[int, ...]) -> bool:
     return pixel[0] > pixel[1] + 30 and pixel[2] > pixel[1] + 10
 
 
-async def test_map_robot_way_obstacle_and_goal_are_drawn_where_they_are(chromium: Browser) -> None:
+async def test_map_robot_path_obstacle_and_goal_are_drawn_at_their_places(
+    chromium: Browser,
+) -> None:
     page = await chromium.open()
     await page.evaluate("document.documentElement.dataset.theme = 'light'")
     await page.click("#theme")
@@ -132,7 +134,7 @@ async def test_map_robot_way_obstacle_and_goal_are_drawn_where_they_are(chromium
     await page.wait_for_selector('#goal:has-text("3.1 m left")')
     assert "about 16 s" in await page.inner_text("#goal")
     assert "then evening round" in await page.inner_text("#goal")
-    for _ in range(600):  # it may be drawn a moment after it is told
+    for _ in range(600):  # the text may be shown before the path is drawn
         dashes = sum([blue(await colour(page, 0.5, y / 100)) for y in range(-140, -60, 2)])
         if dashes:
             break
@@ -175,7 +177,7 @@ async def test_a_gamepad_drives_while_a_shoulder_button_is_held(
     await page.evaluate("pads[0].buttons[5].pressed = true")
     await until(lambda: len(fake.steered) > 3, "steered")
     wanted = fake.steered[-1]
-    # half of what the body can, as the slider stands; half of that for half a stick
+    # the slider is at half of the body's limits; half a stick is half of that
     assert (round(wanted.linear_x, 3), round(wanted.angular_z, 3)) == (0.13, 0.455)
     await page.evaluate("pads[0].buttons[5].pressed = false")
     await until(lambda: fake.steered[-1].linear_x == 0.0, "a zero at the end")
@@ -208,7 +210,7 @@ async def test_button_b_of_any_gamepad_stops_while_a_key_or_the_joystick_is_held
     await page.mouse.up()
 
 
-async def test_a_joystick_that_moves_sends_no_more_commands_than_one_that_is_held(
+async def test_moving_the_joystick_sends_no_additional_commands(
     chromium: Browser, fake: Fake
 ) -> None:
     page = await chromium.open(before=COUNTED)
@@ -216,7 +218,7 @@ async def test_a_joystick_that_moves_sends_no_more_commands_than_one_that_is_hel
     await page.hover("#stick", position={"x": 60, "y": 5})
     await page.mouse.down()
     await until(lambda: fake.steered and fake.steered[-1].linear_x > 0, "driven")
-    # more moves at once than the server takes frames in a second
+    # more moves at once than frames that the server accepts in a second
     assert await page.evaluate(MOVE_STICK_LEFT) == 0
     await until(lambda: fake.steered[-1].angular_z > 0, "turned as the joystick was moved")
     await page.mouse.up()
@@ -224,7 +226,7 @@ async def test_a_joystick_that_moves_sends_no_more_commands_than_one_that_is_hel
 
 
 @pytest.mark.parametrize("file", ["main.js", "link.js", "style.css"])
-async def test_a_page_of_which_a_file_did_not_arrive_is_loaded_again(
+async def test_a_page_reloads_if_one_of_its_files_did_not_arrive(
     chromium: Browser, file: str
 ) -> None:
     await chromium.lose(file)
@@ -235,16 +237,14 @@ async def test_a_page_of_which_a_file_did_not_arrive_is_loaded_again(
 
 async def test_a_connection_whose_end_is_not_reported_is_replaced(chromium: Browser) -> None:
     page = await chromium.open(before=QUICK_CHECKS)
-    await page.evaluate("sockets[0].onmessage = null")  # as when the robot has lost its power
+    await page.evaluate("sockets[0].onmessage = null")  # as when the robot loses its power
     await page.wait_for_selector("#link:not(.live)")
     assert await page.evaluate("sockets[0].readyState") == 1  # open
     await page.wait_for_selector("#link.live")
     assert await page.evaluate("sockets.map((one) => one.readyState > 1)") == [True, False]
 
 
-async def test_an_address_with_a_token_logs_in_a_page_that_is_open_already(
-    chromium: Browser, fake: Fake
-) -> None:
+async def test_an_address_with_a_token_logs_in_an_open_page(chromium: Browser, fake: Fake) -> None:
     page = await chromium.open()
     await page.evaluate("sessionStorage.clear()")
     await page.goto(fake.origin)
@@ -260,27 +260,27 @@ async def test_an_address_with_a_percent_sign_opens_the_page(chromium: Browser, 
     await page.wait_for_selector("#login[open]")
 
 
-async def test_a_driver_that_starts_again_begins_a_new_path_on_the_same_map(
+async def test_a_restarted_driver_begins_a_new_path_on_the_same_map(
     chromium: Browser,
 ) -> None:
     page = await chromium.open()
     assert await page.evaluate(RESTARTED_DRIVER) == [[[5, 0]], True, 3]
 
 
-class Mapless(Fake):
+class FakeWithoutMap(Fake):
     """A robot that makes no map."""
 
-    def say_once(self) -> None:
+    def publish_once(self) -> None:
         body = load_robot("turtlebot3_waffle").description()
         self.robot.publish(BODY, Body(description=body, link="sim"))
 
 
-async def test_of_an_earlier_run_no_map_is_left_after_a_new_connection(tmp_path: Path) -> None:
+async def test_a_new_connection_removes_the_map_of_an_earlier_run(tmp_path: Path) -> None:
     first = Fake(tmp_path)
     async with browser(first, tmp_path / "profile") as chromium:
         async with serving(first):
             page = await chromium.open()
             await drawn(page, -1.5, 0.5, dark, "the wall")
-        async with serving(Mapless(tmp_path, port=first.config.port)):
+        async with serving(FakeWithoutMap(tmp_path, port=first.config.port)):
             await page.wait_for_selector("#link.live")
             await drawn(page, -1.5, 0.5, nothing, "the floor")

@@ -1,4 +1,4 @@
-"""Whatever drives by the page ends with its release, also where a browser reports none."""
+"""Driving ends when a control is released, also if the browser does not report the release."""
 
 import asyncio
 from collections.abc import AsyncIterator
@@ -17,15 +17,15 @@ pytestmark = [needs_browser, pytest.mark.asyncio(loop_scope="module")]
 
 @pytest_asyncio.fixture(loop_scope="module", scope="module")
 async def fake(tmp_path_factory: pytest.TempPathFactory) -> AsyncIterator[Fake]:
-    made = Fake(tmp_path_factory.mktemp("fake"))
-    async with serving(made):
-        yield made
+    fake = Fake(tmp_path_factory.mktemp("fake"))
+    async with serving(fake):
+        yield fake
 
 
 @pytest_asyncio.fixture(loop_scope="module", scope="module")
 async def chromium(fake: Fake, tmp_path_factory: pytest.TempPathFactory) -> AsyncIterator[Browser]:
-    async with browser(fake, tmp_path_factory.mktemp("profile")) as made:
-        yield made
+    async with browser(fake, tmp_path_factory.mktemp("profile")) as chromium:
+        yield chromium
 
 
 async def opened(chromium: Browser, fake: Fake) -> Page:
@@ -46,19 +46,19 @@ async def stays_at_rest(page: Page, fake: Fake) -> None:
     assert len(fake.steered) == count
 
 
-async def test_a_key_that_is_let_go_of_while_cmd_is_held_drives_no_more(
+async def test_a_key_released_while_cmd_is_held_stops_driving(
     chromium: Browser, fake: Fake
 ) -> None:
     page = await opened(chromium, fake)
     await page.keyboard.down("w")
     await drives(fake)
-    await page.keyboard.down("Meta")  # on macOS, no keyup of "w" comes from now on
+    await page.keyboard.down("Meta")  # on macOS, no keyup of "w" is reported any more
     await stays_at_rest(page, fake)
     await page.keyboard.up("Meta")
     await page.keyboard.up("w")
 
 
-async def test_a_key_that_is_let_go_of_while_a_dialog_is_open_drives_no_more(
+async def test_a_key_released_while_a_dialog_is_open_stops_driving(
     chromium: Browser, fake: Fake
 ) -> None:
     page = await opened(chromium, fake)
@@ -66,7 +66,7 @@ async def test_a_key_that_is_let_go_of_while_a_dialog_is_open_drives_no_more(
     await drives(fake)
 
     async def answer(dialog: Dialog) -> None:
-        await asyncio.sleep(1.5)  # the key is let go of meanwhile, which the page is not told
+        await asyncio.sleep(1.5)  # the key is released meanwhile, which is not reported to the page
         await dialog.dismiss()
 
     page.once("dialog", answer)
@@ -94,7 +94,7 @@ async def test_a_gamepad_held_while_the_robot_was_latched_must_be_pressed_again(
     await page.close()
 
 
-async def test_a_gamepad_drives_by_the_window_with_the_focus_only(
+async def test_a_gamepad_drives_only_in_the_window_with_the_focus(
     chromium: Browser, fake: Fake
 ) -> None:
     page = await opened(chromium, fake)
@@ -120,4 +120,4 @@ async def test_the_joystick_ignores_the_right_button_and_opens_no_menu(
     await page.wait_for_timeout(500)
     assert fake.steered == []
     await page.mouse.up(button="right")
-    assert await page.evaluate("menu") is False  # it would hide the release of the left button
+    assert await page.evaluate("menu") is False  # a menu would hide the release of the left button

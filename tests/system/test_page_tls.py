@@ -1,4 +1,4 @@
-"""The page over TLS: a token opens it to drive, and another to look."""
+"""The page over TLS: one token allows driving, the other only viewing."""
 
 import datetime
 from pathlib import Path
@@ -12,8 +12,8 @@ from tests.system.page import OPERATOR, VIEWER, browser, needs_browser
 pytestmark = needs_browser
 
 
-def certificate(folder: Path) -> dict[str, str]:
-    """A page's own certificate, as people make one."""
+def make_certificate(folder: Path) -> dict[str, str]:
+    """Return the settings of a self-signed certificate in `folder`."""
     from cryptography import x509
     from cryptography.hazmat.primitives import hashes, serialization
     from cryptography.hazmat.primitives.asymmetric import ec
@@ -21,7 +21,7 @@ def certificate(folder: Path) -> dict[str, str]:
     key = ec.generate_private_key(ec.SECP256R1())
     name = x509.Name([x509.NameAttribute(x509.NameOID.COMMON_NAME, "127.0.0.1")])
     now = datetime.datetime.now(datetime.UTC)
-    made = (
+    certificate = (
         x509.CertificateBuilder()
         .subject_name(name)
         .issuer_name(name)
@@ -34,16 +34,16 @@ def certificate(folder: Path) -> dict[str, str]:
     plain = serialization.NoEncryption()
     form = serialization.PrivateFormat.PKCS8
     pem = serialization.Encoding.PEM
-    (folder / "page.crt").write_bytes(made.public_bytes(pem))
+    (folder / "page.crt").write_bytes(certificate.public_bytes(pem))
     (folder / "page.key").write_bytes(key.private_bytes(pem, form, plain))
     return {"certificate": str(folder / "page.crt"), "certificate_key": str(folder / "page.key")}
 
 
-async def test_over_tls_a_token_opens_the_page_to_drive_and_another_to_look(
+async def test_over_tls_one_token_allows_driving_and_the_other_only_viewing(
     tmp_path: Path,
 ) -> None:
     pytest.importorskip("cryptography")
-    fake = Fake(tmp_path, **certificate(tmp_path))
+    fake = Fake(tmp_path, **make_certificate(tmp_path))
     async with serving(fake), browser(fake, tmp_path / "profile") as chromium:
         page = await chromium.open()
         assert page.url.startswith("https://")
@@ -51,7 +51,7 @@ async def test_over_tls_a_token_opens_the_page_to_drive_and_another_to_look(
         await page.keyboard.down("w")
         await until(lambda: fake.steered and fake.steered[-1].linear_x > 0.1, "steered")
         await page.keyboard.up("w")
-        await until(lambda: fake.steered[-1].linear_x == 0.0, "let go")
+        await until(lambda: fake.steered[-1].linear_x == 0.0, "released")
         viewer = await chromium.open(VIEWER)
         assert await viewer.is_disabled("#estop")
         count = len(fake.steered)

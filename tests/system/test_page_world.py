@@ -19,22 +19,22 @@ from tests.system.page import VIEWER, Browser, Robot, browser, needs_browser
 
 pytestmark = [needs_browser, pytest.mark.asyncio(loop_scope="module")]
 
-LOOKS = 300
+MAX_SCREENSHOTS = 300
 
 
 @pytest.fixture(scope="module")
 def robot(shared_home: Home, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Robot]:
     world = tmp_path_factory.mktemp("world") / "hall.yaml"
     world.write_text("size: [8, 8]\nstart: [0, 0, 0]\n")
-    made = Robot(shared_home, world=str(world), decision={"settings": {"max_linear_speed": 0.01}})
-    yield made
-    made.command.close()
+    robot = Robot(shared_home, world=str(world), decision={"settings": {"max_linear_speed": 0.01}})
+    yield robot
+    robot.command.close()
 
 
 @pytest_asyncio.fixture(loop_scope="module", scope="module")
 async def seen(robot: Robot) -> AsyncIterator[Probe]:
-    async with probing(robot.endpoint) as onlooker:
-        yield onlooker
+    async with probing(robot.endpoint) as probe:
+        yield probe
 
 
 @pytest_asyncio.fixture(loop_scope="module", scope="module")
@@ -42,8 +42,8 @@ async def chromium(
     robot: Robot, tmp_path_factory: pytest.TempPathFactory
 ) -> AsyncIterator[Browser]:
     await robot.served()
-    async with browser(robot, tmp_path_factory.mktemp("profile")) as made:
-        yield made
+    async with browser(robot, tmp_path_factory.mktemp("profile")) as chromium:
+        yield chromium
 
 
 async def opened(chromium: Browser, **how: str) -> Page:
@@ -54,7 +54,7 @@ async def opened(chromium: Browser, **how: str) -> Page:
 
 
 async def picture(page: Page) -> NDArray[np.uint8]:
-    """Grey values of the middle of the view, free of buttons."""
+    """Return the grey values of the middle of the view, where no buttons are."""
     data = await page.locator("#world").screenshot()
     whole = read_png(data, "the view", 8_000_000)
     height, width = whole.shape
@@ -62,7 +62,7 @@ async def picture(page: Page) -> NDArray[np.uint8]:
 
 
 async def changed(page: Page, before: NDArray[np.uint8], pixels: int) -> None:
-    for _ in range(LOOKS):
+    for _ in range(MAX_SCREENSHOTS):
         now = await picture(page)
         if (np.abs(now.astype(int) - before) > 20).sum() > pixels:
             return
@@ -78,7 +78,7 @@ async def things(seen: Probe) -> SimReply:
 async def click_beside(
     page: Page, dx: float, dy: float, *, to: tuple[float, float] | None = None
 ) -> None:
-    """Click, or drag, so many pixels right of and below the robot, which is in the middle."""
+    """Click `dx`, `dy` pixels right of and below the robot, in the middle; or drag from there."""
     area = await page.locator("#world").bounding_box()
     assert area
     x, y = area["x"] + area["width"] / 2, area["y"] + area["height"] / 2
@@ -90,7 +90,7 @@ async def click_beside(
 
 
 @pytest.mark.slow
-async def test_what_is_clicked_into_the_world_is_there_and_drawn(
+async def test_things_are_added_to_the_world_by_clicks_and_drawn(
     chromium: Browser, seen: Probe
 ) -> None:
     page = await opened(chromium)
@@ -103,11 +103,11 @@ async def test_what_is_clicked_into_the_world_is_there_and_drawn(
     await page.click("[data-tool=person]")
     await click_beside(page, -150, 40, to=(-150, -60))
     await page.wait_for_selector('#goal:has-text("person1 is at")')
-    there = await things(seen)
-    box, person = there.things
+    reply = await things(seen)
+    box, person = reply.things
     assert (box.kind, person.kind) == ("box", "person")
-    assert there.robot
-    assert 0.4 < np.hypot(box.x - there.robot.x, box.y - there.robot.y) < 3.0
+    assert reply.robot
+    assert 0.4 < np.hypot(box.x - reply.robot.x, box.y - reply.robot.y) < 3.0
     assert len(person.path) == 1
     before = await picture(page)
     await changed(page, before, 100)  # the person walks

@@ -1,4 +1,4 @@
-"""Zones, places and maps by hand on the page."""
+"""Zones, places and maps that a person edits on the page."""
 
 import asyncio
 from collections.abc import AsyncIterator
@@ -28,10 +28,10 @@ from tests.system.test_page_map import drawn
 pytestmark = [needs_browser, pytest.mark.asyncio(loop_scope="module")]
 
 
-class Mapped(Fake):
+class FakeWithMaps(Fake):
     """A robot with zones and saved maps."""
 
-    answer_s = 0.0  # time that it takes for an answer
+    answer_s = 0.0  # delay of its answers
 
     async def change(self, request: ZonesRequest) -> ZonesReply:
         await asyncio.sleep(self.answer_s)
@@ -46,8 +46,8 @@ class Mapped(Fake):
 
     async def save(self, request: MapRequest) -> MapReply:
         self.saved.append(request)
-        there = "not saved: there is a map attic.yaml already; --replace overwrites it"
-        return MapReply(ok=request.replace, text="saved attic" if request.replace else there)
+        refusal = "not saved: there is a map attic.yaml already; --replace overwrites it"
+        return MapReply(ok=request.replace, text="saved attic" if request.replace else refusal)
 
     async def load(self, request: MapLoadRequest) -> MapReply:
         self.loaded.append(request)
@@ -73,24 +73,24 @@ class Mapped(Fake):
 
 
 @pytest_asyncio.fixture(loop_scope="module", scope="module")
-async def fake(tmp_path_factory: pytest.TempPathFactory) -> AsyncIterator[Mapped]:
-    made = Mapped(tmp_path_factory.mktemp("fake"))
-    made.serve()
-    async with serving(made):
-        yield made
+async def fake(tmp_path_factory: pytest.TempPathFactory) -> AsyncIterator[FakeWithMaps]:
+    fake = FakeWithMaps(tmp_path_factory.mktemp("fake"))
+    fake.serve()
+    async with serving(fake):
+        yield fake
 
 
 @pytest_asyncio.fixture(loop_scope="module", scope="module")
 async def chromium(fake: Fake, tmp_path_factory: pytest.TempPathFactory) -> AsyncIterator[Browser]:
-    async with browser(fake, tmp_path_factory.mktemp("profile")) as made:
-        yield made
+    async with browser(fake, tmp_path_factory.mktemp("profile")) as chromium:
+        yield chromium
 
 
 def reddish(pixel: tuple[int, ...]) -> bool:
     return pixel[0] > pixel[1] + 15 and pixel[0] > pixel[2] + 15
 
 
-async def test_zones_are_drawn_and_made_by_clicks(chromium: Browser, fake: Mapped) -> None:
+async def test_zones_are_drawn_and_created_by_clicks(chromium: Browser, fake: FakeWithMaps) -> None:
     page = await chromium.open()
     await drawn(page, 1.2, -0.75, reddish, "the zone")
     await page.click("#edit-zones")
@@ -124,8 +124,8 @@ async def test_zones_are_drawn_and_made_by_clicks(chromium: Browser, fake: Mappe
     await until(lambda: len(fake.goals) == 1, "a click is a goal again")
 
 
-async def test_places_have_the_heading_of_the_drag_and_are_removed_by_a_click(
-    chromium: Browser, fake: Mapped
+async def test_a_drag_sets_the_heading_of_a_place_and_a_click_removes_it(
+    chromium: Browser, fake: FakeWithMaps
 ) -> None:
     page = await chromium.open()
     await drawn(page, 1.2, -0.75, reddish, "the zone")
@@ -150,7 +150,7 @@ async def test_places_have_the_heading_of_the_drag_and_are_removed_by_a_click(
     assert [one.remove for one in fake.wanted[1:]] == ["desk", "lab"]
 
 
-async def test_maps_are_saved_and_loaded(chromium: Browser, fake: Mapped) -> None:
+async def test_maps_are_saved_and_loaded(chromium: Browser, fake: FakeWithMaps) -> None:
     page = await chromium.open()
     page.on("dialog", lambda dialog: dialog.accept())
     await page.click("#edit-zones")
@@ -165,14 +165,14 @@ async def test_maps_are_saved_and_loaded(chromium: Browser, fake: Mapped) -> Non
     assert (fake.loaded[0].name, fake.loaded[0].mapping) == ("house", "localize")
 
 
-async def test_a_viewer_sees_zones_and_may_not_change_them(chromium: Browser) -> None:
+async def test_a_viewer_sees_zones_but_cannot_change_them(chromium: Browser) -> None:
     page = await chromium.open(VIEWER)
     await drawn(page, 1.2, -0.75, reddish, "the zone")
     assert not await page.is_visible("#edit-zones")
 
 
 async def test_the_page_waits_as_long_as_its_server_for_zones_and_maps(
-    chromium: Browser, fake: Mapped, monkeypatch: pytest.MonkeyPatch
+    chromium: Browser, fake: FakeWithMaps, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     page = await chromium.open()
     await drawn(page, 1.2, -0.75, reddish, "the zone")
@@ -183,5 +183,5 @@ async def test_the_page_waits_as_long_as_its_server_for_zones_and_maps(
     assert box
     await page.mouse.click(box["x"] + box["width"] / 2 + 45, box["y"] + box["height"] / 2)
     note = page.locator("#zone-note")
-    await expect(note).to_have_text("done")  # and no answer is given up on before
+    await expect(note).to_have_text("done")  # the page waits for the answers
     await expect(page.locator("#maps option")).to_have_text(["house", "old"])

@@ -93,7 +93,7 @@ async def test_base_and_joints_move_at_once_and_stop_separately() -> None:
     assert page.jog({PAN: 0.0}, (1.2,), viewer=2)  # it is ignored
     page.arbiter.drive(1, ZERO, 1.24)
     assert page.arbiter.driving(1.24) == 1
-    page.jog({PAN: 1.0}, (1.24,))  # goes on without a pause
+    page.jog({PAN: 1.0}, (1.24,))  # the stream continues without a pause
     page.jog({PAN: 0.0}, (1.28,))
     assert page.arbiter.driving(1.28) == 0
     await settle()

@@ -37,10 +37,10 @@ from gigabrain_zenoh.ui.steering import RateLimiter, TeleopArbiter
 
 def test_tokens_are_created_once_and_readable_only_by_their_owner(tmp_path: Path) -> None:
     path = tmp_path / "page" / "tokens.json"
-    made, new = tokens(path)
-    assert new
+    created, is_new = tokens(path)
+    assert is_new
     assert stat.S_IMODE(path.stat().st_mode) == 0o600
-    assert tokens(path) == (made, False)
+    assert tokens(path) == (created, False)
     path.chmod(0o644)
     with pytest.raises(ConfigError, match="open to others"):
         tokens(path)
@@ -58,7 +58,7 @@ def test_processes_that_create_tokens_at_the_same_time_get_the_same_ones(tmp_pat
         with ThreadPoolExecutor(16) as pool:
             found = list(pool.map(lambda _, path=path: tokens(path), range(32)))  # type: ignore[misc]
         assert len({both for both, _ in found}) == 1
-        assert [made for _, made in found].count(True) == 1
+        assert [is_new for _, is_new in found].count(True) == 1
         assert stat.S_IMODE(path.stat().st_mode) == 0o600
     assert len(list(tmp_path.iterdir())) == 4
 
@@ -77,10 +77,10 @@ def test_tokens_are_read_from_a_folder_that_cannot_be_written(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = tmp_path / "tokens.json"
-    made, _ = tokens(path)
+    created, _ = tokens(path)
     read_only = OSError(30, "Read-only file system")
     monkeypatch.setattr("tempfile.NamedTemporaryFile", lambda **_: (_ for _ in ()).throw(read_only))
-    assert tokens(path) == (made, False)
+    assert tokens(path) == (created, False)
     with pytest.raises(ConfigError, match=r"other\.json: Read-only file system"):
         tokens(tmp_path / "other.json")
 
@@ -90,9 +90,9 @@ def test_an_empty_file_of_tokens_is_replaced_with_a_warning(
 ) -> None:
     path = tmp_path / "tokens.json"
     path.touch(0o600)
-    made, new = tokens(path)
-    assert new
-    assert tokens(path) == (made, False)
+    created, is_new = tokens(path)
+    assert is_new
+    assert tokens(path) == (created, False)
     assert caplog.messages == [f"{path} was empty; replaced it"]
 
 
@@ -137,8 +137,11 @@ async def test_a_certificate_that_cannot_be_served_is_refused_before_the_page_is
 def test_new_tokens_are_printed_once(tmp_path: Path) -> None:
     config = PageConfig(login=True, tokens=str(tmp_path / "tokens.json"))
     first, second = Access(config, 8080), Access(config, 8080)
-    made, _ = tokens(tmp_path / "tokens.json")
-    assert first.new_tokens_text() == f"to drive:     {made.operator}\nto view only: {made.viewer}"
+    created, _ = tokens(tmp_path / "tokens.json")
+    assert (
+        first.new_tokens_text()
+        == f"to drive:     {created.operator}\nto view only: {created.viewer}"
+    )
     assert second.new_tokens_text() == ""
     assert Access(PageConfig(), 8080).new_tokens_text() == ""
 
@@ -154,8 +157,8 @@ def test_a_page_for_the_network_requires_tls_and_a_token(tmp_path: Path) -> None
         check(PageConfig(certificate="none.pem", certificate_key="none.key"))
     path = tmp_path / "tokens.json"
     access = Access(PageConfig(listen="192.168.1.10", tokens=str(path)), 8080)
-    made, _ = tokens(path)
-    assert [access.role(token) for token in (made.operator, made.viewer, "", "é")] == [
+    created, _ = tokens(path)
+    assert [access.role(token) for token in (created.operator, created.viewer, "", "é")] == [
         "operator", "viewer", None, None,
     ]  # fmt: skip
     assert Access(PageConfig(), 8080).role("") == "operator"
