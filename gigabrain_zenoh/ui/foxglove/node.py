@@ -221,7 +221,7 @@ class FoxgloveSteering(ServerListener):
     def on_get_parameters(
         self, client: Client, param_names: list[str], request_id: str | None = None
     ) -> list[Parameter]:
-        """Return the parameters with these names; all if there are none."""
+        """Return the parameters with these names, or all parameters without names."""
         return self.requests.get(param_names)
 
     def on_set_parameters(
