@@ -181,7 +181,7 @@ def drive_of(content: bytes) -> Velocity:
 
 
 def decoded(content: bytes, kind: type[T]) -> T:
-    """Return the Login, Jog or PageRequest in a frame. Raises ValueError."""
+    """Decode the JSON of a frame as `kind`. Raises ValueError."""
     try:
         return msgspec.json.decode(content, type=kind)
     except DECODE_ERRORS as error:

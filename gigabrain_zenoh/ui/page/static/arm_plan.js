@@ -17,7 +17,7 @@ function hand({ position, orientation, opening }, colour) {
   return [box([-long, 0, half], FINGER_M), box([-long, 0, -half], FINGER_M), box([-2 * long, 0, 0], [FINGER_M[2], FINGER_M[1], half])]
 }
 
-/** Return the boxes: half its size, its pose in the frame of the body, and its colour. */
+/** Return the boxes, each with half its size, its pose in the frame of the body, and its colour. */
 export function planMarks({ path, grasps }) {
   const beads = path.map((point) => ({ size: [BEAD_M, BEAD_M, BEAD_M], pose: [...point, ...LEVEL], colour: PATH }))
   return [...beads, ...grasps.flatMap((grasp, i) => hand(grasp, i ? OTHER : CHOSEN))]

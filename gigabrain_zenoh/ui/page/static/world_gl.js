@@ -223,7 +223,7 @@ export class Renderer {
     this.#bodies = parts.map((part) => this.#stored(part))
   }
 
-  /** Set the boxes to draw in the frame of a body: half its size, its pose, and its colour from 0 to 255. */
+  /** Set the boxes to draw in the frame of a body, each with half its size, its pose, and its colour (0 to 255). */
   mark(boxes) {
     const triangles = new Triangles()
     for (const { size, pose, colour } of boxes) triangles.add(...box(size), pose, packed(colour))
