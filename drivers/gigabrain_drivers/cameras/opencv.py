@@ -1,10 +1,13 @@
 """Cameras through OpenCV: USB (v4l2), network streams (RTSP, HTTP), and video files."""
 
 import math
+import os
 import re
+import socket
 import time
 from pathlib import Path
 from typing import Any
+from urllib.parse import urlsplit
 
 import cv2
 import numpy as np
@@ -17,6 +20,14 @@ TIMEOUT_MS = 3000  # for opening a stream, and for reading from it
 ASPECT_TOLERANCE = 0.01  # relative difference of the aspect ratios of two pictures
 MAX_PIXELS = 16_000_000  # of a picture before scaling
 MAX_BROKEN = 1000  # after this many broken pictures in a row, a film has ended
+# port of a stream, and a request that a server answers whatever it streams; one that expects TLS
+# answers it with an error
+QUESTIONS = {
+    "rtsp": (554, b"OPTIONS * RTSP/1.0\r\nCSeq: 1\r\n\r\n"),
+    "rtsps": (322, b"OPTIONS * RTSP/1.0\r\nCSeq: 1\r\n\r\n"),
+    "http": (80, b"HEAD / HTTP/1.0\r\n\r\n"),
+    "https": (443, b"HEAD / HTTP/1.0\r\n\r\n"),
+}
 
 
 class OpenCvOptions(CameraOptions, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -46,6 +57,8 @@ class OpenCvCamera(CameraSource):
         timeouts = [cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, TIMEOUT_MS]
         timeouts += [cv2.CAP_PROP_READ_TIMEOUT_MSEC, TIMEOUT_MS]
         network = isinstance(target, str) and "://" in target
+        if network and (problem := _unanswered(self.options.device)):
+            raise CameraLost(f"{self._shown} {problem}")
         capture = cv2.VideoCapture(target, backend, timeouts if network else [])
         self._capture, self._due_s, self._reads = capture, time.monotonic(), 0
         if not capture.isOpened():
@@ -121,6 +134,38 @@ class OpenCvCamera(CameraSource):
         if not self._file and not path.is_char_device():  # opening a pipe would block all others
             raise CameraLost(f"{device} is no camera and no file")
         return str(path), cv2.CAP_ANY
+
+
+def _unanswered(address: str) -> str:
+    """Return why a stream's server does not answer within TIMEOUT_MS; empty if it does.
+
+    FFmpeg opens one stream at a time in a process. Without this check, a silent one would keep the
+    other cameras from opening. Also return an empty text where this cannot be checked.
+    """
+    try:
+        url = urlsplit(address)
+        host, port = url.hostname, url.port
+    except ValueError:
+        return ""
+    default, question = QUESTIONS.get(url.scheme, (0, b""))
+    by_proxy = url.scheme.startswith("http") and os.environ.get("http_proxy")
+    if not host or not question or by_proxy:
+        return ""
+    try:
+        server = socket.create_connection((host, port or default), TIMEOUT_MS / 1e3)
+    except TimeoutError:
+        return "does not answer"
+    except (OSError, UnicodeError):
+        return "cannot be opened"
+    with server:
+        try:
+            server.sendall(question)
+            server.recv(1)
+        except TimeoutError:
+            return "does not answer"
+        except OSError:  # it closed the connection, which is an answer
+            pass
+    return ""
 
 
 def fitted(picture: NDArray[Any], width: int, height: int) -> Picture:

@@ -2,15 +2,19 @@
 
 import contextlib
 import os
+import socket
+import threading
 import time
 from collections.abc import Callable, Container
 from contextlib import closing
+from http.server import BaseHTTPRequestHandler, HTTPServer
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 
+from gigabrain_drivers.cameras import opencv
 from gigabrain_drivers.cameras.base import CameraLost, CameraSite, CameraSource
 from gigabrain_drivers.cameras.opencv import OpenCvCamera, OpenCvOptions, fitted
 from gigabrain_drivers.cameras.replay import ReplayedCamera, ReplayOptions
@@ -53,6 +57,32 @@ def means(source: CameraSource, count: int) -> list[int]:
     pictures = [source.read().picture for _ in range(count)]
     assert all(one is not None and one.shape == (48, 64, 3) for one in pictures)
     return [round(float(one.mean()) / 40) * 40 for one in pictures if one is not None]
+
+
+class Opening(threading.Thread):
+    """Opens a source in a thread, and keeps the text of its error."""
+
+    def __init__(self, source: CameraSource) -> None:
+        super().__init__(daemon=True)
+        self._source, self.error = source, ""
+        self.start()
+
+    def run(self) -> None:
+        try:
+            self._source.open()
+        except CameraLost as error:
+            self.error = str(error)
+
+
+def waits_on(connection: socket.socket) -> bool:
+    """Return whether the other end has not closed a connection."""
+    connection.setblocking(False)
+    try:
+        while connection.recv(1000):
+            pass
+    except BlockingIOError:
+        return True
+    return False
 
 
 def test_a_film_is_shown_at_the_camera_s_rate_and_ends(tmp_path: Path, slept: list[float]) -> None:
@@ -184,6 +214,57 @@ def test_a_stream_is_named_by_its_host_alone(tmp_path: Path, address: str, shown
     with pytest.raises(CameraLost) as caught:
         source.open()
     assert str(caught.value) == f"{shown} cannot be opened"
+
+
+@pytest.mark.parametrize("scheme", ["rtsp", "http", "https"])
+def test_a_silent_stream_does_not_keep_other_cameras_from_opening(
+    tmp_path: Path, scheme: str
+) -> None:
+    film(tmp_path / "film.avi")
+    server = socket.create_server(("127.0.0.1", 0))
+    address = f"{scheme}://127.0.0.1:{server.getsockname()[1]}"
+    opening = Opening(camera(tmp_path, f"{address}/live"))
+    connection, _ = server.accept()  # it never answers
+    with closing(connection), closing(camera(tmp_path, "film.avi")) as other:
+        server.close()
+        other.open()
+        assert waits_on(connection)
+    opening.join()
+    assert opening.error == f"{address} cannot be opened"
+
+
+class Stream(BaseHTTPRequestHandler):
+    """Serves an endless stream of one picture."""
+
+    def do_GET(self) -> None:
+        self.send_response(200)
+        self.send_header("Content-Type", "multipart/x-mixed-replace; boundary=next")
+        self.end_headers()
+        part = b"--next\r\nContent-Type: image/jpeg\r\n\r\n" + jpeg(120) + b"\r\n"
+        with contextlib.suppress(OSError):
+            while self.wfile.write(part):
+                pass
+
+    def log_message(self, *_: object) -> None: ...
+
+
+def test_a_stream_of_a_server_with_one_client_at_a_time_is_read(tmp_path: Path) -> None:
+    with HTTPServer(("127.0.0.1", 0), Stream) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        with closing(camera(tmp_path, f"http://127.0.0.1:{server.server_port}/live")) as source:
+            source.open()
+            assert means(source, 2) == [120, 120]
+        server.shutdown()
+
+
+def test_a_stream_that_answers_nothing_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(opencv, "TIMEOUT_MS", 50)
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        silent = camera(tmp_path, f"rtsp://127.0.0.1:{server.getsockname()[1]}/live")
+        with pytest.raises(CameraLost, match=r"rtsp://127.0.0.1:\d+ does not answer"):
+            silent.open()
 
 
 def test_grey_pictures_get_three_channels_and_enormous_ones_are_refused() -> None:
