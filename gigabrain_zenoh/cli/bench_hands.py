@@ -228,7 +228,7 @@ def _hands_table(result: "HandsResult") -> Table:
     failed = "; ".join(f"{n} {what}" for what, n in wrong.items()) or "None failed"
     table.caption = (
         f"{result.body}{play}. {by_camera}{failed}. "
-        f"Joints beyond their ranges, by the physics: {sum(run.broken_limits for run in runs)} "
+        f"Joints beyond their limits, by the physics: {sum(run.broken_limits for run in runs)} "
         f"ticks; fastest {max(run.fastest for run in runs):.0%} of the greatest speed. "
         f"A thing takes {seconds:.1f} s (p50); planning {p50:.2f} s, p95 {p95:.2f} s."
     )

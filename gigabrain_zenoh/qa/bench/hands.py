@@ -56,7 +56,7 @@ PLACED_M = 0.01  # largest error of a thing that counts as placed
 SETTLE_TICKS = 25
 TARGETS = 20  # largest number of places to try
 FRICTION_2_3 = "0.02 0.0005"  # torsional and rolling friction of things
-SLACK = 0.001  # share of a joint's range by which it may exceed its limits
+SLACK = 0.001  # share of a joint's range, or of its speed, by which it may exceed its limits
 Progress = Callable[[str], None]
 
 
@@ -75,7 +75,7 @@ class HandsRun(Struct, frozen=True, kw_only=True):
     seconds: float = 0.0  # of the robot's time
     planning_s: float = 0.0  # wall time
     fastest: float = 0.0  # highest true speed of a joint, as a share of its limit
-    broken_limits: int = 0  # ticks with a joint beyond its range, by the physics
+    broken_limits: int = 0  # ticks with a joint beyond its range or speed, by the physics
     seen_off_m: float | None = None  # error of the position that was seen last
 
 
@@ -241,13 +241,14 @@ class ArmInMemory:
         self._gate, _ = gate.step(self._gate_config, self._gate, event)
 
     def _breaks_limits(self) -> bool:
-        """Return whether a joint is truly beyond its range; record the highest speed."""
+        """Return whether a joint truly breaks a limit; record the highest speed."""
+        broken = False
         for joint, position, speed in zip(self.description.joints, *self.arm.truth(), strict=True):
-            slack = SLACK * (joint.upper - joint.lower)
-            self.fastest = max(self.fastest, abs(speed) / joint.max_speed)
-            if not joint.lower - slack <= position <= joint.upper + slack:
-                return True
-        return False
+            slack, share = SLACK * (joint.upper - joint.lower), abs(speed) / joint.max_speed
+            self.fastest = max(self.fastest, share)
+            within = joint.lower - slack <= position <= joint.upper + slack and share <= 1 + SLACK
+            broken = broken or not within
+        return broken
 
 
 def arm_before(drawn: Drawn, robot: RobotFile, model: SimModel) -> ArmInMemory:
