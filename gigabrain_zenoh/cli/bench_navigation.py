@@ -362,9 +362,11 @@ def _goals_table(result: "GoalsResult") -> Table:
     ):  # fmt: skip
         table.add_column(Text(name), justify="right")  # fits 80 columns
     for run in result.runs:
+        per_goal = run.seconds_per_goal
         table.add_row(
             run.body, run.world, f"{run.explored_s:.0f}", f"{run.reached}/{run.goals}",
-            f"{run.contacts}", f"{run.min_clearance_m:.3f}", f"{run.seconds_per_goal:.1f}",
+            f"{run.contacts}", f"{run.min_clearance_m:.3f}",
+            "-" if per_goal is None else f"{per_goal:.1f}",
             f"{run.worst_m:.2f}", f"{math.degrees(run.worst_rad):.1f}",
             f"{run.met}", f"{run.alone}",
         )  # fmt: skip

@@ -121,9 +121,9 @@ class GoalFigures(Struct, frozen=True, kw_only=True):
         return max((off.rad for off in self.off if off.rad is not None), default=0.0)
 
     @property
-    def seconds_per_goal(self) -> float:
-        """Mean time from one goal to the next, by the robot's clock [s]."""
-        return (self.seconds - self.explored_s) / self.goals
+    def seconds_per_goal(self) -> float | None:
+        """Mean time from one goal to the next, by the robot's clock [s]; None without goals."""
+        return (self.seconds - self.explored_s) / self.goals if self.goals else None
 
     @property
     def ok(self) -> bool:

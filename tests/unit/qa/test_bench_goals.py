@@ -140,6 +140,13 @@ def test_a_body_that_drives_for_hours_has_a_large_battery(tmp_path: Path) -> Non
     assert (copy.parent / "model.xml").is_file()
 
 
+def test_a_run_that_was_sent_to_no_goal_has_no_time_per_goal() -> None:
+    none = replace(GOOD, goals=0, reached=0, off=())
+    assert none.seconds_per_goal is None
+    assert GOOD.seconds_per_goal == 10.0
+    assert "0/0" in _text(GoalsResult(seed=7, runs=(none,)))
+
+
 def test_the_table_shows_the_figures() -> None:
     lines = _text(GoalsResult(seed=7, runs=(replace(GOOD, body="turtlebot3_waffle"),)))
     for figure in ("seed 7", "x5", "99/100", "0.090", "10.0", "0.11", "5.7"):
