@@ -140,15 +140,22 @@ async def measure_robots(
         )
         for number in range(count)
     )  # fmt: skip
-    robots = await asyncio.gather(
-        *(_run_robot(number, one, seconds, start) for number, one in enumerate(deployments, 1))
-    )
+    running = [
+        asyncio.ensure_future(_run_robot(number, one, seconds, start))
+        for number, one in enumerate(deployments, 1)
+    ]
+    try:
+        robots, busy = await asyncio.gather(*running), await watching
+    finally:  # an error of one robot ends all
+        for task in (watching, *running):
+            task.cancel()
+        await asyncio.gather(watching, *running, return_exceptions=True)
     return RobotsResult(
         body=body,
         world=world,
         seconds=seconds,
         cores=psutil.cpu_count() or 1,
-        busy=await watching,
+        busy=busy,
         robots=tuple(robots),
     )
 

@@ -1,9 +1,18 @@
 """The verdict of `gigabrain bench robots`, and the share of time with a shut gate."""
 
+import asyncio
+
 import pytest
 from msgspec.structs import replace
 
-from gigabrain_zenoh.qa.bench.robots import FleetRobot, RobotsResult, shut_share
+from gigabrain_zenoh.errors import BusError
+from gigabrain_zenoh.qa.bench import robots
+from gigabrain_zenoh.qa.bench.robots import (
+    FleetRobot,
+    RobotsResult,
+    measure_robots,
+    shut_share,
+)
 
 FAST = FleetRobot(
     number=1, distance_m=9.0, real_time=1.0, stood=0.0, p50_ms=8.0, p99_ms=30.0, cpu=0.3,
@@ -71,3 +80,25 @@ def test_a_contact_is_not_a_sign_of_a_small_machine() -> None:
 def test_the_verdict_for_a_large_machine() -> None:
     assert result(FAST).verdict == "this machine carries 1 of these robots"
     assert result(FAST).ok
+
+
+async def test_an_error_of_one_robot_ends_all_of_them(monkeypatch: pytest.MonkeyPatch) -> None:
+    ended: list[int] = []
+
+    async def compiled(_: object) -> None: ...
+
+    async def run_robot(number: int, *_: object) -> FleetRobot:
+        if number == 2:
+            raise BusError("no router")
+        try:
+            await asyncio.Event().wait()
+        finally:
+            ended.append(number)
+        raise AssertionError
+
+    monkeypatch.setattr(robots, "ensure_compiled", compiled)
+    monkeypatch.setattr(robots, "_run_robot", run_robot)
+    with pytest.raises(BusError, match="no router"):
+        await measure_robots("turtlebot3_waffle", "house", 3, 1.0, lambda _: None)
+    assert ended == [1, 3]
+    assert asyncio.all_tasks() == {asyncio.current_task()}
