@@ -2,19 +2,23 @@
 
 import math
 from collections import deque
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Iterable
 from dataclasses import dataclass
 
 from gigabrain_schemas.base import Pose
 from gigabrain_schemas.body import BodyDescription
-from gigabrain_schemas.objects import MapObject, MapTag, ObjectMap
-from gigabrain_schemas.topics import OBJECT_MAP
+from gigabrain_schemas.objects import Labels, MapObject, MapTag, ObjectMap
+from gigabrain_schemas.topics import LABELS, OBJECT_MAP
 from gigabrain_zenoh.bus.bus import Bus
+from gigabrain_zenoh.bus.freshness import Latest
 from gigabrain_zenoh.decision.behaviours import Target
 from gigabrain_zenoh.decision.zones import KEPT
+from gigabrain_zenoh.errors import unknown
+from gigabrain_zenoh.host.bounded import put_newest
 
 TAG_RADIUS_M = 0.02
 MIN_RADIUS_M, MAX_RADIUS_M = 0.02, 1.0
+MAX_RECOGNIZERS = 32
 NO_OBJECTS = ObjectMap()
 Wanted = str | int  # class of an object, or number of a tag
 
@@ -60,6 +64,37 @@ class ObjectSource:
         )
         oldest = self._received[0] if len(self._received) == KEPT else NO_OBJECTS
         return next(earlier, oldest)
+
+
+class LabelSource:
+    """The classes that running processes recognise."""
+
+    def __init__(self, bus: Bus) -> None:
+        self._bus = bus
+        self._newest: dict[str, Latest[Labels]] = {}  # by key
+        self._subscribed = False
+
+    def observe(self, body: BodyDescription | None) -> None:
+        """Subscribe once the body is known to have cameras."""
+        if body and body.cameras and not self._subscribed:
+            self._subscribed = True
+            self._bus.subscribe(LABELS, self._receive)
+
+    def check(self, wanted: Iterable[str], remembered: ObjectMap) -> None:
+        """Raise UnknownName for a class that is neither recognised nor remembered.
+
+        Without a process that publishes its classes, every class is accepted.
+        """
+        fresh = [labels for one in self._newest.values() if (labels := one.fresh())]
+        known = {label for one in fresh for label in one.labels}
+        for label in wanted if fresh else ():
+            if label not in known and not any(one.label == label for one in remembered.objects):
+                raise unknown("label", label, known)
+
+    def _receive(self, key: str, labels: Labels) -> None:
+        latest = self._newest.get(key) or Latest(LABELS, self._bus.clock, self._bus.time)
+        latest.store(labels)
+        put_newest(self._newest, key, latest, MAX_RECOGNIZERS)
 
 
 def sought(

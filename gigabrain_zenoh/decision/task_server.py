@@ -35,7 +35,14 @@ from gigabrain_zenoh.decision.behaviours import (
     describe_end,
 )
 from gigabrain_zenoh.decision.context import ContextSource
-from gigabrain_zenoh.decision.known_objects import ObjectSource, Sought, Wanted, named, sought
+from gigabrain_zenoh.decision.known_objects import (
+    LabelSource,
+    ObjectSource,
+    Sought,
+    Wanted,
+    named,
+    sought,
+)
 from gigabrain_zenoh.decision.tasks import arm_steps, mission_files
 from gigabrain_zenoh.decision.tasks import mission as missions
 from gigabrain_zenoh.decision.tasks.arm_steps import Held
@@ -79,7 +86,7 @@ class TaskServer:
         scripts: str = "",
     ) -> None:
         self._bus, self._check, self._zones, self._source = bus, check, zones, source
-        self._objects = ObjectSource(bus)
+        self._objects, self._labels = ObjectSource(bus), LabelSource(bus)
         self._scripts, self._topics, file = Scripts(scripts), TopicCache(bus), TaskFile(folder)
         saved, problem = file.read()
         if problem:
@@ -106,6 +113,7 @@ class TaskServer:
     def wait(self, state: RobotState) -> None:
         """Call `publish_starting` at the status rate, in every step that advances no tasks."""
         self._tick = state.tick
+        self._observe_things()
         if not 0 <= state.tick - self._status_tick < STATUS_TICKS:
             self.publish_starting()
 
@@ -134,7 +142,7 @@ class TaskServer:
             self._status_tick = 0
         self._cancel_if_map_changed()
         self._topics.observe(state)
-        self._objects.observe(self._source.body)
+        self._observe_things()
         command_or_idle = self._queue.step(seconds, outcome)
         if not 0 <= state.tick - self._status_tick < STATUS_TICKS or self._just_ended():
             self._publish()
@@ -175,6 +183,11 @@ class TaskServer:
         except GigabrainError as error:
             _log_refusal("mission", "itself", error)
         return True
+
+    def _observe_things(self) -> None:
+        """Subscribe to things and their labels once the body is known to have cameras."""
+        self._objects.observe(self._source.body)
+        self._labels.observe(self._source.body)
 
     async def close(self) -> None:
         """Wait until everything is written."""
@@ -255,6 +268,7 @@ class TaskServer:
         """
         wanted: Wanted = request.object if request.tag is None else request.tag
         self._check_cameras()
+        self._labels.check([request.object] if request.object else [], self._objects.newest)
         await self._check(None)
         known = self._seek(wanted, (), None).target
         at = f"{known.name} is at ({known.x:.2f}, {known.y:.2f})" if known else ""
@@ -305,6 +319,7 @@ class TaskServer:
             self._scripts.path(script)
         if mission.looks:
             self._check_cameras()
+        self._labels.check(mission.labels, self._objects.newest)
         if body and (actions := mission.arm_actions):
             arm_steps.check(body, actions, mission.things.values())
 

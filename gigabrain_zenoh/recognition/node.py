@@ -17,9 +17,9 @@ from msgspec.structs import replace
 from gigabrain_schemas.base import Pose
 from gigabrain_schemas.body import Body, Camera, RobotState
 from gigabrain_schemas.brain import PoseInMap
-from gigabrain_schemas.objects import Detections, Point
+from gigabrain_schemas.objects import MAX_LABELS, Detections, Labels, Point
 from gigabrain_schemas.sensors import Image
-from gigabrain_schemas.topics import BODY, DEPTH, DETECTIONS, IMAGE, POSE, STATE
+from gigabrain_schemas.topics import BODY, DEPTH, DETECTIONS, IMAGE, LABELS, POSE, STATE
 from gigabrain_schemas.vision import DepthImage
 from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.config.settings import RecognitionConfig
@@ -37,6 +37,7 @@ log = logging.getLogger(__name__)
 MAX_EARLY_SHARE = 0.25  # of a period; a picture that arrives earlier is skipped
 MAX_DEPTH_WAIT_NS = 60_000_000  # from a picture's arrival to that of its depth
 CONFIRMED_PICTURES = 5  # a warning follows when a tag has another size in so many in a row
+LABELS_TICKS = 50  # robot/labels is published once a second of the robot's time
 MAX_DEPTHS = 4  # newest depth pictures of a camera, kept until its pictures arrive
 INSTALL = "recognition needs OpenCV; install it with: pip install 'gigabrain-zenoh[eyes]'"
 
@@ -73,6 +74,7 @@ class Recognition:
         self._pool = ThreadPoolExecutor(1, "recognition", initializer=step_aside)
         self._inputs: dict[str, _CameraInput] = {}
         self._history = PoseHistory()
+        self._labels_at = 0, 0  # boot and tick of the newest robot/labels
         self._busy, self._closed, self._received, self._done = False, False, 0, 0
         self._size_mismatches: dict[int, int] = {}  # pictures in a row with another size, by tag
         self.failed: asyncio.Future[None] = asyncio.get_running_loop().create_future()
@@ -97,6 +99,7 @@ class Recognition:
 
     def _on_state(self, state: RobotState) -> None:
         self._history = self._history.then(state)
+        self._publish_labels(state)
         self._start()
 
     def _on_depth(self, key: str, depth: DepthImage) -> None:
@@ -180,6 +183,16 @@ class Recognition:
             found = in_map(found, body_pose)
         bus.latency_ms["recognition"] = found.took_ms
         bus.publish(DETECTIONS, found, basis=picture.basis, stamp_ns=picture.stamp_ns)
+
+    def _publish_labels(self, state: RobotState) -> None:
+        """Publish the net's classes if they are due; a net with too many stays unnamed."""
+        boot, tick = self._labels_at
+        if state.boot == boot and 0 <= state.tick - tick < LABELS_TICKS:
+            return
+        self._labels_at = state.boot, state.tick
+        labels = self._observer.labels
+        if len(labels) <= MAX_LABELS:
+            self._bus.publish(LABELS, Labels(labels=labels), name=self._bus.process)
 
     def _body_pose(self, boot: int, tick: int) -> Pose | None:
         """Return the body's pose in the map at `tick`; None if it is not localized."""

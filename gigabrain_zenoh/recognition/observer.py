@@ -67,6 +67,12 @@ class Observer:
         )
 
     @property
+    def labels(self) -> tuple[str, ...]:
+        """The classes of things that it finds, each once."""
+        classes = self._net.classes if self._net else ()
+        return tuple(dict.fromkeys(one for one in classes if one))
+
+    @property
     def other_sizes(self) -> dict[int, float]:
         """The measured sizes of tags that differ from the settings, by tag [m]."""
         return dict(self._tags.other_sizes)

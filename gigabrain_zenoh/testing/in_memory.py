@@ -109,9 +109,9 @@ class NodeBench:
         await self.bus.close()
         assert isinstance(result, asyncio.CancelledError), result
 
-    def send(self, topic: Topic[M], message: M) -> None:
+    def send(self, topic: Topic[M], message: M, *, name: str = "") -> None:
         """Deliver `message` to the node with the header it has."""
-        self.network.deliver(topic.at(), codec.encode(message))
+        self.network.deliver(topic.at(name), codec.encode(message))
 
     def sent(self, topic: Topic[M]) -> list[M]:
         """Return the node's messages on `topic` since the last call.

@@ -41,6 +41,11 @@ ORT = "needs ONNX Runtime; install it with: pip install onnxruntime"
 class Net(Protocol):
     """Finds things in a picture (h, w, 3), RGB."""
 
+    @property
+    def classes(self) -> Sequence[str]:
+        """The class of each of its outputs; an empty one is not reported."""
+        ...
+
     def find(self, picture: Picture) -> Found:
         """Return the things in it, most confident first."""
         ...
@@ -111,7 +116,7 @@ class YoloNet:
     """
 
     def __init__(self, path: Path, classes: Sequence[str], config: RecognizerConfig) -> None:
-        self._classes, self._least = classes, config.min_confidence
+        self.classes, self._least = classes, config.min_confidence
         self._size = _input_size(path)
         self._net = read_net(path)
         self._path = path
@@ -133,13 +138,13 @@ class YoloNet:
         fitted, scale, left, top = fit(picture, (width, height))
         raw = np.asarray(self._answers(fitted), np.float32)[0]
         boxes, labels, sure = self._unpacked(raw)
-        wanted = np.flatnonzero(_known(labels, self._classes) & np.isfinite(boxes).all(axis=1))
+        wanted = np.flatnonzero(_known(labels, self.classes) & np.isfinite(boxes).all(axis=1))
         best = wanted[np.argsort(-sure[wanted], kind="stable")[:MAX_CANDIDATES]]
         boxes, labels, sure = boxes[best], labels[best], sure[best]
         if not self._final:
             kept = suppress(boxes, labels, sure)
             boxes, labels, sure = boxes[kept], labels[kept], sure[kept]
-        return Found(unfit(boxes, picture, scale, left, top), labels, sure, self._classes)
+        return Found(unfit(boxes, picture, scale, left, top), labels, sure, self.classes)
 
     def _answers(self, fitted: Picture) -> NDArray[Any]:
         blob = cv2.dnn.blobFromImage(fitted, 1 / 255.0)
@@ -150,7 +155,7 @@ class YoloNet:
         if self._final:
             final = raw[raw[:, 4] >= self._least]
             return final[:, :4], final[:, 5].astype(np.int64), np.minimum(final[:, 4], 1)
-        scores = np.where(_named_ones(self._classes)[:, None], raw[4:], 0)
+        scores = np.where(_named_ones(self.classes)[:, None], raw[4:], 0)
         labels, sure = np.asarray(scores.argmax(axis=0), np.int64), scores.max(axis=0)
         chosen = np.flatnonzero(sure >= self._least)
         return _corners(raw[:4, chosen].T), labels[chosen], np.minimum(sure[chosen], 1)
@@ -170,7 +175,7 @@ class DetrNet:
         self._input: str = self._session.get_inputs()[0].name
         self._outputs = [one.name for one in self._session.get_outputs()]
         logits, _ = self._run(np.zeros((*(self._size or (320, 320)), 3), np.uint8))
-        self._classes = _named(classes, logits.shape[1], path)
+        self.classes = _named(classes, logits.shape[1], path)
         none = logits.shape[1] == len(classes) + 1
         self._softmax = none and "dets" not in self._outputs  # RF-DETR has none, but a sigmoid
         if len(classes) == len(COCO_IDS):
@@ -185,14 +190,14 @@ class DetrNet:
                 scores = (scores / scores.sum(axis=1, keepdims=True))[:, :-1]
             else:
                 scores = 1 / (1 + np.exp(-logits))
-        scores = np.where(_named_ones(self._classes)[: scores.shape[1]], scores, 0)
+        scores = np.where(_named_ones(self.classes)[: scores.shape[1]], scores, 0)
         labels, sure = scores.argmax(axis=1), scores.max(axis=1)
         index = np.flatnonzero((sure >= self._least) & np.isfinite(boxes).all(axis=1))
         index = index[np.argsort(-sure[index], kind="stable")][:MAX_CANDIDATES]
         height, width = picture.shape[:2]
         sides = np.array((width, height, width, height))
         corners = np.clip(_corners(boxes[index]) * sides, 0, sides).astype(np.float32)
-        return Found(corners, labels[index], sure[index].astype(np.float32), self._classes)
+        return Found(corners, labels[index], sure[index].astype(np.float32), self.classes)
 
     def _run(self, picture: Picture) -> tuple[Floats, Floats]:
         """Return logits (n, classes) and boxes (n, 4)."""

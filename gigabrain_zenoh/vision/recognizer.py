@@ -62,7 +62,7 @@ class Recognizer:
                 f"{weights}: no such file; `python -m gigabrain_zenoh.qa.train all` makes it"
             )
         self._net = read_net(weights)
-        self._min_confidence, self._classes = min_confidence, classes
+        self._min_confidence, self.classes = min_confidence, classes
 
     def find(self, picture: Picture) -> Found:
         """Find things in a picture (h, w, 3), RGB, of any size."""
@@ -77,7 +77,7 @@ class Recognizer:
         self._net.setInput(cv2.dnn.blobFromImage(fitted, 1 / 255.0))
         found = decode(np.asarray(self._net.forward())[0], self._min_confidence)
         boxes = unfit(found.boxes, picture, scale, left, top)
-        return Found(boxes, found.labels, found.confidences, self._classes)
+        return Found(boxes, found.labels, found.confidences, self.classes)
 
 
 def read_net(path: Path) -> cv2.dnn.Net:

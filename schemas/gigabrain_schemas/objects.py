@@ -26,6 +26,7 @@ Label = Annotated[str, Meta(min_length=1, max_length=64)]
 Extent = tuple[Distance, Distance]  # [m] width and height
 Length = Annotated[float, Meta(gt=0.0, le=10.0)]  # [m]
 Seconds = Annotated[float, Meta(ge=0.0, le=1e9)]
+MAX_LABELS = 2048  # of one process
 SIZES = {"box": 3, "cylinder": 2, "sphere": 1}  # number of lengths in the size of a solid
 
 
@@ -61,6 +62,12 @@ class Detections(Message, frozen=True, kw_only=True):
     things: Annotated[tuple[Detection, ...], Meta(max_length=128)] = ()
     tags: Annotated[tuple[TagDetection, ...], Meta(max_length=64)] = ()
     took_ms: Annotated[float, Meta(ge=0.0, le=1e6)] = 0.0
+
+
+class Labels(Message, frozen=True, kw_only=True):
+    """The classes of things that a process recognises in pictures; none if only tags."""
+
+    labels: Annotated[tuple[Label, ...], Meta(max_length=MAX_LABELS)]
 
 
 class MapObject(Record, frozen=True, kw_only=True):

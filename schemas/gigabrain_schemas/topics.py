@@ -126,6 +126,10 @@ DETECTIONS = Topic(
     "robot/detections", objects.Detections, 5, depth=8, max_bytes=64 * KB, publishers=BRAIN,
     drawing="detections",
 )  # fmt: skip
+LABELS = Topic(
+    "robot/labels", objects.Labels, 1, keep=True, max_bytes=1024 * KB, many=True,
+    publishers=BRAIN, priority="background",
+)  # fmt: skip
 OBJECT_MAP = Topic(
     "robot/objects", objects.ObjectMap, 1, keep=True, max_bytes=128 * KB, publishers=BRAIN,
     drawing="objects",

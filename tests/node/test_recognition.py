@@ -4,7 +4,7 @@ import asyncio
 import logging
 import math
 import threading
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Sequence
 from contextlib import asynccontextmanager
 from typing import Any
 
@@ -15,9 +15,9 @@ from msgspec.structs import replace
 
 from gigabrain_schemas.body import Camera
 from gigabrain_schemas.brain import PoseInMap
-from gigabrain_schemas.objects import Detections
+from gigabrain_schemas.objects import Detections, Labels
 from gigabrain_schemas.sensors import Image
-from gigabrain_schemas.topics import BODY, DEPTH, DETECTIONS, IMAGE, POSE, STATE
+from gigabrain_schemas.topics import BODY, DEPTH, DETECTIONS, IMAGE, LABELS, POSE, STATE
 from gigabrain_schemas.vision import DepthImage, pack_depth
 from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.bus.transport import LocalNetwork
@@ -45,6 +45,8 @@ STAMP_NS = 1_795_580_000_000_000_000
 
 class SeesABall:
     """A net that sees the same ball in each picture, or hangs."""
+
+    classes: Sequence[str] = CLASSES
 
     def __init__(self) -> None:
         self.seen, self.go_on = 0, threading.Event()
@@ -340,6 +342,26 @@ def test_a_picture_of_another_camera_is_not_looked_at():
     picture = Image(frame_id="rear", width=320, height=240, encoding="mono8", data=TAG.tobytes())
     with pytest.raises(ValueError, match="rear"):
         Observer(SeesABall(), TagFinder()).observe(CAMERA, picture, None)
+
+
+async def test_the_classes_of_the_net_are_published_once_a_second():
+    async with running() as robot:
+        received: list[tuple[str, Labels]] = []
+        robot.bus.subscribe(LABELS, lambda key, message: received.append((key, message)))
+        for tick in (41, 90, 91, 140, 141):
+            robot.be(tick)
+            await settle()
+        assert [key for key, _ in received] == ["robot/labels/recognition"] * 2  # 40 was before
+        labels = received[0][1].labels
+        assert {"can", "person"} < set(labels)
+        assert [message.tick for _, message in received] == [90, 140]
+
+
+def test_a_class_without_a_name_or_named_twice_is_published_once_or_never():
+    net = SeesABall()
+    net.classes = ("can", "", "ball", "can")
+    assert Observer(net, TagFinder()).labels == ("can", "ball")
+    assert Observer(None, TagFinder()).labels == ()
 
 
 async def test_pictures_of_a_camera_on_an_arm_are_not_looked_at():

@@ -7,9 +7,9 @@ import pytest
 from msgspec.structs import replace
 
 from gigabrain_schemas.body import Camera
-from gigabrain_schemas.objects import MapObject, MapTag, ObjectMap
+from gigabrain_schemas.objects import Labels, MapObject, MapTag, ObjectMap
 from gigabrain_schemas.tasks import GoalRequest, MissionRequest
-from gigabrain_schemas.topics import GOAL, MISSION, OBJECT_MAP, ZONES
+from gigabrain_schemas.topics import GOAL, LABELS, MISSION, OBJECT_MAP, ZONES
 from gigabrain_schemas.zones import Place, Zones
 from gigabrain_zenoh.testing.samples import ARMED, WAFFLE, WRIST
 from tests.node.plane import CELL, Plane, drawn
@@ -43,6 +43,7 @@ class Seeing(Plane):
         self.things, self.tags = list(things), list(tags)
         self.found: dict[int, MapObject] = {}
         self.recognizing, self.knows_tags = True, True
+        self.labels: dict[str, tuple[str, ...]] = {}  # of each process that publishes its own
 
     async def _tick(self) -> None:
         for one in self.things:
@@ -60,6 +61,9 @@ class Seeing(Plane):
                 boot=self.boot, tick=self.tick, basis=self.tick,
             )  # fmt: skip
             self.bench.send(OBJECT_MAP, message)
+            for process, labels in self.labels.items():
+                own = Labels(labels=labels, boot=self.boot, tick=self.tick)
+                self.bench.send(LABELS, own, name=process)
 
     def _there(self, number: int) -> bool:
         return any(one.id == number for one in self.things)
@@ -175,3 +179,56 @@ async def test_the_name_of_an_object_as_place_is_refused_with_the_right_command(
         zones = Zones(places=(Place(name="can", x=2.0, y=2.0),), boot=plane.boot, tick=plane.tick)
         plane.bench.send(ZONES, zones)
         assert (await plane.ask(GOAL, GoalRequest(place="can"))).ok
+
+
+@pytest.mark.parametrize(
+    "request_",
+    [
+        GoalRequest(object="cann"),
+        MissionRequest(mission="do: [{fallback: [{find: ball}, {find: cann}]}]"),
+        MissionRequest(mission="things: {it: {label: cann}}\ndo: [{find: ball}]"),
+    ],
+)
+async def test_a_label_that_nothing_recognises_is_refused_with_the_nearest(
+    request_: GoalRequest | MissionRequest,
+) -> None:
+    async with Seeing() as plane:
+        plane.labels = {"recognition": ("can", "ball"), "mine": ("cup",)}
+        await plane.go(2.0)
+        service = GOAL if isinstance(request_, GoalRequest) else MISSION
+        reply = await plane.ask(service, request_)
+        assert not reply.ok
+        assert reply.text == "no label 'cann'; did you mean 'can'? known: ball, can, cup"
+        assert plane.status.current is None
+
+
+async def test_a_label_that_only_another_process_recognises_is_sought() -> None:
+    async with Seeing() as plane:
+        plane.labels = {"recognition": ("can", "ball"), "mine": ("cup",)}
+        await plane.go(2.0)
+        reply = await plane.ask(GOAL, GoalRequest(object="cup"))
+        assert reply.text == "goal-1: a cup is not known yet; looking for it"
+
+
+async def test_a_remembered_thing_is_found_though_its_label_is_no_longer_recognised() -> None:
+    async with Seeing(thing(3, 2.8, 1.2, "shoe")) as plane:
+        plane.labels = {"recognition": ("can", "ball")}
+        await plane.go(2.0)
+        reply = await plane.ask(GOAL, GoalRequest(object="shoe"))
+        assert reply.text == "goal-1: shoe 3 is at (2.80, 1.20)"
+
+
+async def test_any_label_is_sought_once_the_recogniser_has_been_silent_for_five_seconds() -> None:
+    async with Seeing() as plane:
+        plane.labels = {"recognition": ("can", "ball")}
+        await plane.go(2.0)
+        assert not (await plane.ask(GOAL, GoalRequest(object="cann"))).ok
+        plane.labels = {}
+        await plane.go(6.0)
+        assert (await plane.ask(GOAL, GoalRequest(object="cann"))).ok
+
+
+async def test_a_body_without_cameras_does_not_listen_for_labels() -> None:
+    async with Plane(FLAT) as plane:
+        await plane.go(0.5)
+        assert LABELS.at("*") not in plane.bench.bus.listens

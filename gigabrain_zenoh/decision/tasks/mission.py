@@ -201,6 +201,12 @@ class Mission(Part, frozen=True, kw_only=True):
             for _, step in steps_of(self)
         )
 
+    @property
+    def labels(self) -> Iterator[str]:
+        """Classes of objects that cameras have to recognise."""
+        yield from (step.find for _, step in steps_of(self) if isinstance(step.find, str))
+        yield from (thing.label for thing in self.things.values() if thing.label)
+
 
 class PatrolFile(Part, frozen=True, kw_only=True):
     """The file of `gigabrain patrol`."""

@@ -28,6 +28,7 @@ REQUIRED: dict[str, set[str]] = {
     "WorldModel": {"scan_ok", "obstacle_ahead"},
     "Objects": {"objects"},
     "Detections": {"camera", "width", "height"},
+    "Labels": {"labels"},
     "ObjectMap": set(),
     "Solids": set(),
     "PoseRequest": {"x", "y"},
@@ -105,6 +106,7 @@ def test_the_table_has_the_keys_and_rates_of_the_design() -> None:
         "robot/world": ("WorldModel", 10),
         "robot/perceived/*": ("Objects", 10),
         "robot/detections": ("Detections", 5),
+        "robot/labels/*": ("Labels", 1),
         "robot/objects": ("ObjectMap", 1),
         "robot/solids": ("Solids", 5),
         "robot/pose": ("PoseInMap", 10),
@@ -148,6 +150,7 @@ def test_a_value_is_stale_after_the_allowed_number_of_missed_periods() -> None:
         "robot/world": 250_000_000,
         "robot/perceived": 500_000_000,
         "robot/detections": 1_000_000_000,
+        "robot/labels": 5_000_000_000,
         "robot/objects": 5_000_000_000,
         "robot/solids": 2_000_000_000,
         "robot/pose": 500_000_000,
@@ -213,7 +216,7 @@ def test_every_message_is_frozen_and_documented_and_has_the_header(
 def test_the_golden_folder_contains_the_examples_byte_for_byte() -> None:
     stored = {path.name: path.read_bytes() for path in examples.FOLDER.iterdir()}
     assert stored == examples.files()
-    assert len(stored) == 124
+    assert len(stored) == 126
 
 
 @by_name
