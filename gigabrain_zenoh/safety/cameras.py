@@ -135,7 +135,10 @@ class Cameras(Struct, frozen=True, kw_only=True):
 
     def obstacles(self, pose: Pose) -> Floats:
         """Return obstacles and holes around a body at `pose`, (n, 2) [m] in its frame."""
-        points = self.marks.points[self.marks.level > PENDING, :2]
+        believed = self.marks.level > PENDING
+        points = self.marks.points[believed, :2]
+        if not believed.any():
+            return points
         return transform(from_pose(relative(pose, Pose(x=0.0, y=0.0, yaw=0.0))), points)
 
     def _due(self, camera: Camera, image: DepthImage, state: RobotState) -> bool:

@@ -44,3 +44,7 @@ def test_a_picture_with_an_unknown_pose_is_ignored(missing: str) -> None:
     cameras = Cameras().then(SEEING, {"front": Picture(image=old)}, now, history)
     assert not len(cameras.marks.level)
     assert [cause.code for cause in cameras.causes] == ["camera_lost"]
+
+
+def test_without_marks_there_are_no_obstacles_at_any_pose() -> None:
+    assert Cameras().obstacles(Pose(x=1.0, y=2.0, yaw=0.3)).shape == (0, 2)
