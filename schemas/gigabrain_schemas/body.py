@@ -322,7 +322,7 @@ class Thresholds(Record, frozen=True, kw_only=True):
 DEFAULT = Thresholds()
 
 
-class BodyDescription(Record, frozen=True, kw_only=True):
+class BodyDescription(Record, frozen=True, kw_only=True, cache_hash=True):
     """The description of a body for the brain. The common part of a robot's YAML file."""
 
     robot_type: Name  # name of the model

@@ -89,3 +89,8 @@ def test_turning_brakes_by_angles() -> None:
     turn = brakes(body())["turn_left"]
     assert turn.distance(1.82) == pytest.approx(1.82 * 0.32 + 1.82**2 / 6)
     assert turn.resume == pytest.approx(0.10 / 0.253, abs=0.001)  # 10 cm at the farthest corner
+
+
+def test_a_body_keeps_its_hash_for_caches_such_as_that_of_its_brakes() -> None:
+    assert BodyDescription.__struct_config__.cache_hash
+    assert hash(body()) == hash(body()) != hash(body(1.32))
