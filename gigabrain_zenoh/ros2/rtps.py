@@ -1,9 +1,9 @@
-"""Services over DDS, as Fast DDS and Cyclone DDS under ROS 2 call and answer them.
+"""Services over DDS, compatible with rmw_fastrtps and rmw_cyclonedds of ROS 2.
 
-A service is two topics: requests `rq/<name>Request` and replies `rr/<name>Reply`. rmw_fastrtps
-names the request that a reply belongs to in the inline QoS of the sample, rmw_cyclonedds in 16
-bytes before the payload. Cyclone DDS's library cannot write that inline QoS, so services have a
-participant of their own.
+A service is two topics: requests `rq/<name>Request` and replies `rr/<name>Reply`. A reply names
+its request: in the inline QoS of the sample (rmw_fastrtps), or in 16 bytes before the payload
+(rmw_cyclonedds). The library of Cyclone DDS cannot write that inline QoS, so services have a
+separate participant, implemented here.
 """
 
 import asyncio
@@ -34,15 +34,15 @@ from gigabrain_zenoh.ros2.transport import Answer
 
 log = logging.getLogger(__name__)
 
-MAX_RUNNING = 64  # requests of one service that are handled at once; more are dropped
+MAX_RUNNING = 64  # requests of one service in progress; further ones are dropped
 ENCAPSULATION_BYTES, CYCLONE_HEADER_BYTES = 4, 16
-REFRESH_S = 2.0
-READY_S = 1.0  # a server that answers no greeting is asked all the same
+REFRESH_S = 2.0  # period of reading this host's addresses
+READY_S = 1.0  # after this time, a request is sent even if no server is confirmed as ready
 POLL_S = 0.01
 
 
 class ServiceType(NamedTuple):
-    """A type of services, with ROS's hashes of both messages, empty where they are not known."""
+    """A service type, with the ROS hashes of its two messages; empty if unknown."""
 
     name: str  # "std_srvs/srv/SetBool"
     request_hash: str = ""  # "RIHS01_..."
@@ -50,10 +50,10 @@ class ServiceType(NamedTuple):
 
 
 class RequestReply:
-    """A participant for services. `open` it, and `close` it at the end."""
+    """A participant for services. Create it by `open`, and `close` it at the end."""
 
     def __init__(self, sockets: Sockets, enclave: str) -> None:
-        """Create a participant that is not connected; see `open`."""
+        """Create a participant without open sockets; use `open` instead."""
         self._sockets, self._enclave = sockets, enclave
         self._prefix = VENDOR_UNKNOWN + secrets.token_bytes(10)
         self.participant = Participant(
@@ -74,24 +74,24 @@ class RequestReply:
     ) -> Self:
         """Open a participant of a DDS domain. Raises BusError, ConfigError.
 
-        With `localhost` it meets participants of this host only, without multicast. `peers` are
-        IPv4 addresses of hosts that multicast does not reach.
+        With `localhost`, it communicates only with participants of this host, without multicast.
+        `peers` are IPv4 addresses of hosts that multicast does not reach.
         """
         if not 0 <= domain <= MAX_DOMAIN:
             raise ConfigError(f"domain: expected 0 to {MAX_DOMAIN}, got {domain}")
-        made = cls(Sockets(domain, localhost=localhost, peers=peers), enclave)
+        participant = cls(Sockets(domain, localhost=localhost, peers=peers), enclave)
         try:
-            await made._sockets.open(made._receive)
+            await participant._sockets.open(participant._receive)
         except BaseException:
-            made._sockets.close()
+            participant._sockets.close()
             raise
-        made._refresh()
-        made._ticking = asyncio.create_task(made._tick())
-        made._ticking.add_done_callback(_report)
-        return made
+        participant._refresh()
+        participant._ticking = asyncio.create_task(participant._tick())
+        participant._ticking.add_done_callback(_report)
+        return participant
 
     async def close(self) -> None:
-        """Say goodbye to all, and close the sockets; may be called again."""
+        """Announce the end to all participants, and close the sockets. May be called twice."""
         if self._ticking:
             self._ticking.cancel()
             await asyncio.wait([self._ticking])
@@ -106,7 +106,7 @@ class RequestReply:
         self._sockets.close()
 
     def serve(self, service: str, type_: ServiceType, handle: Answer) -> "Server":
-        """Answer the requests to an absolute service name. Raises BusError for a second server."""
+        """Serve an absolute service name. Raises BusError if it is already served here."""
         if service in self._servers:
             raise BusError(f"{service}: this process has a server of that name already")
         server = Server(self, service, type_, handle)
@@ -116,7 +116,7 @@ class RequestReply:
     async def call(
         self, service: str, type_: ServiceType, request: bytes, timeout_s: float
     ) -> bytes:
-        """Return the first reply of a server. Raises NoAnswer if none comes in time."""
+        """Return the first reply of a server. Raises NoAnswer after `timeout_s`."""
         if own := self._servers.get(service):
             return await own.ask(request, timeout_s)
         key = service, type_
@@ -131,17 +131,17 @@ class RequestReply:
 
     def add_pair(
         self,
-        out: tuple[str, str, str],
-        into: tuple[str, str, str],
+        written: tuple[str, str, str],
+        read: tuple[str, str, str],
         deliver: Callable[[bytes, Data], None],
     ) -> tuple[ReliableWriter, ReliableReader, bytes]:
-        """Add a writer and a reader, each by (topic, type, hash); also return the reader's GUID."""
+        """Add a writer and a reader, each of (topic, type, hash); also return the reader's GUID."""
         participant, now = self.participant, time.monotonic()
         writer = ReliableWriter(participant.next_entity(WRITER_KIND), participant.send)
         reader = ReliableReader(participant.next_entity(READER_KIND), participant.send, deliver)
         guid = self._prefix + reader.entity
-        participant.add_reader(reader, EndpointData(guid, *into[:2], type_hash=into[2]), now)
-        data = EndpointData(self._prefix + writer.entity, *out[:2], type_hash=out[2])
+        participant.add_reader(reader, EndpointData(guid, *read[:2], type_hash=read[2]), now)
+        data = EndpointData(self._prefix + writer.entity, *written[:2], type_hash=written[2])
         participant.add_writer(writer, data, now)
         return writer, reader, guid
 
@@ -184,12 +184,12 @@ class RequestReply:
 
 
 class Server:
-    """A service that this process answers."""
+    """A service that this process serves."""
 
     def __init__(self, bus: RequestReply, service: str, type_: ServiceType, handle: Answer) -> None:
         """Announce the service."""
         self.service, self.handle, self._bus = service, handle, bus
-        self.dropped = 0  # requests that came while too many were handled
+        self.dropped = 0  # requests beyond MAX_RUNNING
         self._running: set[asyncio.Task[None]] = set()
         self._fault = QuietFault(log)
         requests, replies = service_topics(service)
@@ -212,7 +212,7 @@ class Server:
         return self._writer.pending
 
     async def ask(self, request: bytes, timeout_s: float) -> bytes:
-        """Return the reply to a request of this process. Raises NoAnswer."""
+        """Return the reply to a request from this process. Raises NoAnswer."""
         try:
             async with asyncio.timeout(timeout_s):
                 return await self.handle(request)
@@ -220,7 +220,7 @@ class Server:
             raise NoAnswer(f"{self.service}: no reply within {timeout_s:g} s") from None
 
     def close(self) -> None:
-        """Withdraw the service. Requests that are being handled get no reply."""
+        """Withdraw the service. Requests in progress get no reply."""
         self.cancel()
         self._bus.forget(self)
 
@@ -245,12 +245,13 @@ class Server:
             request, header = _take_header(request)
         reply = await self.handle(request)
         related = data.related.guid if data.related else bytes(16)
-        asker = related if related[:12] == writer[:12] else writer  # the client's reader, if named
-        target = asker if related == asker else writer[:12]
+        # the request may name the client's reader; otherwise its writer identifies the client
+        client = related if related[:12] == writer[:12] else writer
+        target = client if related == client else writer[:12]
         if header:
             target, reply = writer[:12], _put_header(reply, header)
         now = time.monotonic()
-        self._writer.write(reply, now, related=Sample(asker, data.seq), target=target)
+        self._writer.write(reply, now, related=Sample(client, data.seq), target=target)
 
     def _finish(self, task: asyncio.Task[None]) -> None:
         self._running.discard(task)
@@ -277,7 +278,7 @@ class _Client:
             (replies, reply, type_.reply_hash),
             self._on_reply,
         )
-        self._names = self._guid, self._guid[:12] + self._writer.entity  # in replies
+        self._guids = self._guid, self._guid[:12] + self._writer.entity  # replies name one of them
 
     async def call(self, request: bytes, timeout_s: float) -> bytes:
         """Send a request; return the first reply. Raises NoAnswer."""
@@ -298,19 +299,19 @@ class _Client:
                 self._waiting.pop(number, None)
 
     def fail(self, why: str) -> None:
-        """End all calls."""
+        """End all calls with NoAnswer."""
         for future in self._waiting.values():
             if not future.done():
                 future.set_exception(NoAnswer(f"{self._service}: {why}"))
 
     async def _servers(self, timeout_s: float) -> list[bytes]:
-        """Return the GUIDs of the servers' readers, once they can reply."""
+        """Wait for servers that can reply; return the GUIDs of their readers."""
         started = time.monotonic()
         while True:
-            repliers = {guid[:12]: one for guid, one in self._reader.writers.items()}
-            askers = self._writer.readers
-            found = {guid: one for guid, one in askers.items() if guid[:12] in repliers}
-            ready = [g for g, one in found.items() if one.answered and repliers[g[:12]].answered]
+            writers = {guid[:12]: writer for guid, writer in self._reader.writers.items()}
+            readers = self._writer.readers
+            found = {guid: reader for guid, reader in readers.items() if guid[:12] in writers}
+            ready = [g for g, each in found.items() if each.answered and writers[g[:12]].answered]
             late = time.monotonic() - started > min(READY_S, timeout_s / 2)
             if ready or (found and late):
                 return ready or list(found)
@@ -336,7 +337,7 @@ class _Client:
             reply, header = _take_header(reply)
             if header[:8] == self._guid[4:12]:
                 number = -int.from_bytes(header[8:], "little")
-        elif data.related and data.related.guid in self._names:
+        elif data.related and data.related.guid in self._guids:
             number = data.related.seq
         future = self._waiting.get(number)
         if future and not future.done():
@@ -349,7 +350,7 @@ def _report(ticking: asyncio.Task[None]) -> None:
 
 
 def _take_header(payload: bytes) -> tuple[bytes, bytes]:
-    """Return (payload, header) of what Cyclone DDS's rmw layer wrote."""
+    """Split a payload of rmw_cyclonedds into (payload, header)."""
     end = ENCAPSULATION_BYTES + CYCLONE_HEADER_BYTES
     return payload[:ENCAPSULATION_BYTES] + payload[end:], payload[ENCAPSULATION_BYTES:end]
 

@@ -1,6 +1,6 @@
 """Discovery data of RTPS: participants and endpoints as parameter lists, ports and addresses.
 
-Source: OMG DDSI-RTPS 2.3, chapters 8.5 and 9.6; user data as ROS 2's rmw layer writes them.
+Source: OMG DDSI-RTPS 2.3, chapters 8.5 and 9.6; for user data, the rmw layers of ROS 2.
 """
 
 import socket
@@ -22,13 +22,13 @@ from gigabrain_zenoh.ros2.transport import dds_type
 Address = tuple[str, int]  # IPv4 address and UDP port
 
 MULTICAST_GROUP = "239.255.0.1"
-MAX_DOMAIN, MAX_PARTICIPANTS = 232, 120  # participants of a domain on one host
+MAX_DOMAIN, MAX_PARTICIPANTS = 232, 120  # the latter: of one domain on one host
 MAX_PORT = 65535
 PARTICIPANT = bytes((0, 0, 1, 0xC1))
 SPDP_WRITER, SPDP_READER = bytes((0, 1, 0, 0xC2)), bytes((0, 1, 0, 0xC7))
 PUBLICATIONS_WRITER, PUBLICATIONS_READER = bytes((0, 0, 3, 0xC2)), bytes((0, 0, 3, 0xC7))
 SUBSCRIPTIONS_WRITER, SUBSCRIPTIONS_READER = bytes((0, 0, 4, 0xC2)), bytes((0, 0, 4, 0xC7))
-WRITER_KIND, READER_KIND = 0x03, 0x04  # of entities without a key
+WRITER_KIND, READER_KIND = 0x03, 0x04  # last byte of the entity id, for topics without a key
 BUILTIN_ENDPOINTS = 0x3F  # announcers and detectors of participants, publications, subscriptions
 HAS_PUBLICATIONS_WRITER, HAS_PUBLICATIONS_READER = 1 << 2, 1 << 3
 HAS_SUBSCRIPTIONS_WRITER, HAS_SUBSCRIPTIONS_READER = 1 << 4, 1 << 5
@@ -46,18 +46,18 @@ MAX_LOCATORS, MAX_NAME_BYTES = 16, 512
 
 
 class ParticipantData(NamedTuple):
-    """A participant, and where it listens."""
+    """A participant, and the addresses at which it listens."""
 
     prefix: bytes
-    builtin: tuple[Address, ...]  # for discovery
-    user: tuple[Address, ...]
+    builtin: tuple[Address, ...]  # addresses for discovery data
+    user: tuple[Address, ...]  # addresses for samples of topics
     lease_s: float = 10.0
-    endpoints: int = BUILTIN_ENDPOINTS
+    endpoints: int = BUILTIN_ENDPOINTS  # bits of its discovery endpoints
     vendor: bytes = VENDOR_UNKNOWN
     enclave: str = "/"
 
     def encode(self) -> bytes:
-        """Return the payload of the announcement."""
+        """Return the payload of its announcement."""
         user_data = f"enclave={self.enclave};".encode() + b"\0"
         return _PARAMETER_LIST + encode_parameters(
             [
@@ -74,7 +74,7 @@ class ParticipantData(NamedTuple):
         )
 
     def encode_key(self) -> bytes:
-        """Return the payload of the announcement that this participant leaves."""
+        """Return the payload that announces the end of this participant."""
         guid = self.prefix + PARTICIPANT
         return _PARAMETER_LIST + encode_parameters([(_PARTICIPANT_GUID, guid)])
 
@@ -83,12 +83,12 @@ class EndpointData(NamedTuple):
     """A reader or writer of a topic."""
 
     guid: bytes
-    topic: str  # as DDS names it: "rq/estopRequest"
+    topic: str  # DDS name: "rq/estopRequest"
     type: str  # "std_srvs::srv::dds_::SetBool_Request_"
     reliable: bool = True
     durability: int = _VOLATILE  # 1 is transient local, 2 transient, 3 persistent
-    partitioned: bool = False
-    locators: tuple[Address, ...] = ()  # empty: those of its participant
+    partitioned: bool = False  # true: only for endpoints in a partition, which ours are not
+    locators: tuple[Address, ...] = ()  # empty: the addresses of its participant
     type_hash: str = ""  # "RIHS01_..."
 
     @property
@@ -117,11 +117,11 @@ class EndpointData(NamedTuple):
         )
 
     def encode_key(self) -> bytes:
-        """Return the payload of the announcement that this endpoint is gone."""
+        """Return the payload that announces the end of this endpoint."""
         return _PARAMETER_LIST + encode_parameters([(_ENDPOINT_GUID, self.guid)])
 
     def matches(self, other: "EndpointData") -> bool:
-        """Return whether this writer and that reader, or the reverse, exchange samples."""
+        """Return whether one is a writer, the other a reader, and they exchange samples."""
         if self.topic != other.topic or self.type != other.type:
             return False
         if self.is_writer == other.is_writer or self.partitioned or other.partitioned:
@@ -159,7 +159,7 @@ def decode_endpoint(payload: bytes) -> EndpointData:
         guid=guid,
         topic=_text(order, found.get(_TOPIC_NAME, [b""])[0]),
         type=_text(order, found.get(_TYPE_NAME, [b""])[0]),
-        reliable=kind == _RELIABLE if kind else is_writer,  # the defaults differ
+        reliable=kind == _RELIABLE if kind else is_writer,  # only writers are reliable by default
         durability=struct.unpack(order + "I", durability[:4])[0] if len(durability) >= 4 else 0,
         partitioned=len(partition) >= 4 and any(partition[:4]),
         locators=_locators(order, found.get(_ENDPOINT_LOCATOR, ())),
@@ -167,17 +167,17 @@ def decode_endpoint(payload: bytes) -> EndpointData:
 
 
 def multicast_port(domain: int) -> int:
-    """Return the port of announcements to all participants of a domain."""
+    """Return the multicast port for announcements in a domain."""
     return 7400 + 250 * domain
 
 
 def participant_ports(domain: int, index: int) -> tuple[int, int]:
-    """Return the ports of discovery and of user data of the participant `index` on a host."""
+    """Return the ports (discovery, user data) of the participant `index` on a host."""
     return multicast_port(domain) + 10 + 2 * index, multicast_port(domain) + 11 + 2 * index
 
 
 def host_ports(domain: int) -> list[tuple[int, int]]:
-    """Return the ports of a domain's participants on a host; the last domain has 63 pairs only."""
+    """Return the port pairs of a domain's participants on a host; domain 232 has only 63."""
     pairs = (participant_ports(domain, index) for index in range(MAX_PARTICIPANTS))
     return [pair for pair in pairs if pair[1] <= MAX_PORT]
 
@@ -191,27 +191,27 @@ def encode_locator(address: Address) -> bytes:
 def choose_address(
     locators: Iterable[Address], source: str, own: Collection[str]
 ) -> Address | None:
-    """Return the locator to send to: on the host that the announcement came from.
+    """Return the first locator on the host that sent the announcement; None without one.
 
-    `own` are the addresses of this host. None if no locator is there: a participant cannot make
-    others send to a third host.
+    `own` are the addresses of this host. Other locators are ignored, so that a participant cannot
+    make us send to a third host.
     """
     found = list(locators)
     for host, port in found:
         if host == source:
             return host, port
     if source in own:
-        return next((one for one in found if one[0] in own), None)
+        return next((each for each in found if each[0] in own), None)
     return None
 
 
 def service_topics(service: str) -> tuple[str, str]:
-    """Return the topics of a service's requests and replies: `/a/b` -> `rq/a/bRequest`, ..."""
+    """Return the topics of requests and replies: `rq/a/bRequest`, `rr/a/bReply` for `/a/b`."""
     return f"rq{service}Request", f"rr{service}Reply"
 
 
 def service_types(name: str) -> tuple[str, str]:
-    """Return the types on the wire of requests and responses of `std_srvs/srv/SetBool`.
+    """Return the DDS types of requests and responses of a type such as `std_srvs/srv/SetBool`.
 
     Raises ConfigError for a name of another form.
     """
@@ -238,7 +238,7 @@ def _guid(found: dict[int, list[bytes]], pid: int) -> bytes:
 
 
 def _locators(order: str, values: Iterable[bytes]) -> tuple[Address, ...]:
-    """Return the usable ones among locators."""
+    """Return the usable locators: UDP over IPv4, with a valid port, not multicast."""
     found = []
     for value in list(values)[:MAX_LOCATORS]:
         if len(value) < 24:

@@ -1,7 +1,7 @@
 """Reliable reader of RTPS, as a state machine without sockets or clocks.
 
-Source: OMG DDSI-RTPS 2.3, chapter 8.4. Times are in seconds of any one clock. All memory is
-bounded, whatever a peer sends; the answer to a datagram is at most one datagram.
+Source: OMG DDSI-RTPS 2.3, chapter 8.4. Times are in seconds of any monotonic clock. No peer can
+make it use unbounded memory. A submessage is answered by at most two datagrams.
 """
 
 import math
@@ -22,21 +22,21 @@ from gigabrain_zenoh.ros2.rtps_wire import (
 from gigabrain_zenoh.ros2.rtps_writer import Send
 
 MAX_SAMPLE_BYTES, MAX_FRAGMENTS = 1 << 20, 4096
-MAX_EARLY = WINDOW  # samples of one writer that came out of order
-MAX_ALL_EARLY, MAX_EARLY_BYTES = 4096, 4 << 20  # of all writers of a reader
-MAX_ASSEMBLIES, ASSEMBLY_S = 8, 5.0  # fragmented samples of a reader that are not complete
-GREET_S, SLOWEST_GREETING_S = 0.5, 8.0  # requests for a first heartbeat: the wait doubles
-MAX_STRANGERS = 256  # writers that have sent heartbeats before they were announced
-ASK_S = 0.005  # a reader asks one writer for missing samples at most so often
+MAX_EARLY = WINDOW  # out-of-order samples kept for one writer
+MAX_ALL_EARLY, MAX_EARLY_BYTES = 4096, 4 << 20  # out-of-order samples kept for all writers
+MAX_ASSEMBLIES, ASSEMBLY_TIMEOUT_S = 8, 5.0  # incomplete fragmented samples of one reader
+MIN_GREETING_S, MAX_GREETING_S = 0.5, 8.0  # period of requests for a first heartbeat; it doubles
+MAX_STRANGERS = 256  # writers that sent heartbeats before their announcement
+MIN_REQUEST_S = 0.005  # minimum time between two requests to a writer for missing samples
 
 
 @dataclass(slots=True, eq=False)
 class _Assembly:
-    """A sample of which not all fragments are here."""
+    """A fragmented sample that is still incomplete."""
 
-    data: DataFragments
-    at_s: float
-    parts: dict[int, bytes] = field(default_factory=dict)
+    data: DataFragments  # the first received ones
+    received_s: float  # time of the newest fragment
+    parts: dict[int, bytes] = field(default_factory=dict)  # by fragment number, from 1
 
     @property
     def total(self) -> int:
@@ -50,24 +50,24 @@ class _Assembly:
 
 @dataclass(slots=True, eq=False)
 class _Writer:
-    """A remote writer, as its reader knows it."""
+    """A reader's state of one remote writer."""
 
     guid: bytes
     address: Address
-    next: int = 1  # the sample to deliver next
-    early: dict[int, Data | None] = field(default_factory=dict)  # None: it does not concern us
+    next: int = 1  # sequence number of the sample to deliver next
+    early: dict[int, Data | None] = field(default_factory=dict)  # None: not for this reader
     assemblies: dict[int, _Assembly] = field(default_factory=dict)
-    answered: bool = False
-    wait_s: float = GREET_S
-    due_s: float = 0.0
-    asked_s: float = -1.0
+    answered: bool = False  # true: it has sent a heartbeat or a gap
+    wait_s: float = MIN_GREETING_S
+    due_s: float = 0.0  # time of the next greeting
+    requested_s: float = -1.0  # time of the newest request for samples
 
 
 class ReliableReader:
-    """A reader that hands on each sample of its matched writers once, in order."""
+    """A reader that delivers each sample of its matched writers once, in order."""
 
     def __init__(self, entity: bytes, send: Send, deliver: Callable[[bytes, Data], None]) -> None:
-        """Create a reader with an entity id; `deliver` gets a writer's GUID and its sample."""
+        """Create a reader with an entity id; it calls `deliver` with (writer's GUID, sample)."""
         self.entity = entity
         self.writers: dict[bytes, _Writer] = {}
         self._send, self._deliver, self._serial = send, deliver, 0
@@ -92,7 +92,7 @@ class ReliableReader:
         self._strangers.pop(guid, None)
 
     def on_data(self, guid: bytes, data: Data, now: float) -> None:
-        """Take a sample."""
+        """Process a sample."""
         writer = self.writers.get(guid)
         if writer is None or data.seq < writer.next or data.seq in writer.early:
             return
@@ -105,11 +105,11 @@ class ReliableReader:
         if data.seq < writer.next + MAX_EARLY and self._has_room(len(data.payload)):
             writer.early[data.seq] = data
             self._early, self._early_bytes = self._early + 1, self._early_bytes + len(data.payload)
-        if now - writer.asked_s >= ASK_S:
-            self._ask(writer, data.seq, now)
+        if now - writer.requested_s >= MIN_REQUEST_S:
+            self._request_missing(writer, data.seq, now)
 
     def on_fragments(self, guid: bytes, part: DataFragments, now: float) -> None:
-        """Take fragments of a sample, and the sample when all are here."""
+        """Process fragments of a sample, and the whole sample once it is complete."""
         writer = self.writers.get(guid)
         if writer is None or part.sample_bytes > MAX_SAMPLE_BYTES:
             return
@@ -122,7 +122,7 @@ class ReliableReader:
             if assembly is None and self._assemblies() >= MAX_ASSEMBLIES:
                 return
             assembly = writer.assemblies[part.seq] = _Assembly(part, now)
-        assembly.at_s = now
+        assembly.received_s = now
         for number in range(part.first, min(part.first + part.number, assembly.total + 1)):
             start = (number - part.first) * part.fragment_bytes
             size = min(part.fragment_bytes, part.sample_bytes - (number - 1) * part.fragment_bytes)
@@ -130,24 +130,24 @@ class ReliableReader:
             if len(piece) == size:
                 assembly.parts.setdefault(number, piece)
         if len(assembly.parts) == assembly.total:
-            whole = b"".join(assembly.parts[n] for n in range(1, assembly.total + 1))
+            payload = b"".join(assembly.parts[n] for n in range(1, assembly.total + 1))
             related = assembly.data.related or part.related
-            self.on_data(guid, Data(part.reader, part.writer, part.seq, whole, related), now)
+            self.on_data(guid, Data(part.reader, part.writer, part.seq, payload, related), now)
 
     def on_heartbeat(self, guid: bytes, beat: Heartbeat, now: float) -> None:
-        """Ask for what is missing of what the writer has."""
+        """Request the missing samples of those that the writer has."""
         writer = self.writers.get(guid)
         if writer is None:
             if len(self._strangers) < MAX_STRANGERS:
                 self._strangers[guid] = None
             return
         writer.answered = True
-        self._skip(writer, beat.first)  # what the writer no longer has will never come
+        self._skip(writer, beat.first)  # the writer no longer has the samples before
         if not beat.final or writer.next <= beat.last:
-            self._ask(writer, beat.last, now)
+            self._request_missing(writer, beat.last, now)
 
     def on_heartbeat_fragments(self, guid: bytes, beat: HeartbeatFragments, now: float) -> None:
-        """Ask for the missing fragments of a sample."""
+        """Request the missing fragments of a sample."""
         writer = self.writers.get(guid)
         assembly = writer.assemblies.get(beat.seq) if writer else None
         missing = [n for n in assembly.missing() if n <= beat.last] if assembly else []
@@ -155,7 +155,7 @@ class ReliableReader:
             self._nack_fragments(writer, beat.seq, tuple(missing))
 
     def on_gap(self, guid: bytes, gap: Gap, now: float) -> None:
-        """Stop waiting for samples that do not concern this reader."""
+        """Stop waiting for samples that are not for this reader."""
         writer = self.writers.get(guid)
         if writer is None:
             return
@@ -175,8 +175,11 @@ class ReliableReader:
         due = math.inf
         for writer in self.writers.values():
             if writer.assemblies:
-                kept = ((s, a) for s, a in writer.assemblies.items() if now - a.at_s <= ASSEMBLY_S)
-                writer.assemblies = dict(kept)
+                writer.assemblies = {
+                    seq: assembly
+                    for seq, assembly in writer.assemblies.items()
+                    if now - assembly.received_s <= ASSEMBLY_TIMEOUT_S
+                }
             if not writer.answered:
                 if now >= writer.due_s:
                     self._greet(writer, now)
@@ -188,11 +191,11 @@ class ReliableReader:
 
     def _greet(self, writer: _Writer, now: float) -> None:
         writer.due_s = now + writer.wait_s
-        writer.wait_s = min(2 * writer.wait_s, SLOWEST_GREETING_S)
+        writer.wait_s = min(2 * writer.wait_s, MAX_GREETING_S)
         self._acknack(writer, (), final=False)
 
     def _skip(self, writer: _Writer, first: int) -> None:
-        """Deliver what is here of the samples below `first`, and go on with `first`."""
+        """Deliver the received samples below `first`, and continue with `first`."""
         if first <= writer.next:
             return
         for seq in sorted(seq for seq in writer.early if seq < first):
@@ -222,13 +225,13 @@ class ReliableReader:
     def _has_room(self, size: int) -> bool:
         return self._early < MAX_ALL_EARLY and self._early_bytes + size <= MAX_EARLY_BYTES
 
-    def _ask(self, writer: _Writer, last: int, now: float) -> None:
-        """Acknowledge, and ask for samples up to `last`."""
-        writer.asked_s = now
+    def _request_missing(self, writer: _Writer, last: int, now: float) -> None:
+        """Acknowledge received samples, and request missing ones up to `last`."""
+        writer.requested_s = now
         window = range(writer.next, min(last + 1, writer.next + WINDOW))
-        lacking = [seq for seq in window if seq not in writer.early]
-        partial = [seq for seq in lacking if seq in writer.assemblies]
-        self._acknack(writer, tuple(seq for seq in lacking if seq not in partial), final=True)
+        missing = [seq for seq in window if seq not in writer.early]
+        partial = [seq for seq in missing if seq in writer.assemblies]
+        self._acknack(writer, tuple(seq for seq in missing if seq not in partial), final=True)
         for seq in partial[:1]:
             self._nack_fragments(writer, seq, writer.assemblies[seq].missing())
 

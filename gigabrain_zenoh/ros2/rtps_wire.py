@@ -1,8 +1,8 @@
 """Wire format of RTPS: messages, submessages and parameter lists. Pure functions.
 
 Source: OMG DDSI-RTPS 2.3, chapters 8.3 and 9.4. A GUID is 16 bytes: a prefix of 12 bytes, which
-names the participant, and an entity id of 4 bytes. Received data may have either byte order; what
-is written here is little-endian.
+names the participant, and an entity id of 4 bytes. Decoders accept both byte orders, encoders
+write little-endian.
 """
 
 import struct
@@ -14,12 +14,12 @@ VENDOR_UNKNOWN, VENDOR_CYCLONE = bytes((0, 0)), bytes((1, 16))
 UNKNOWN_ENTITY = bytes(4)
 
 PID_SENTINEL, PID_KEY_HASH, PID_STATUS_INFO = 0x0001, 0x0070, 0x0071
-PID_RELATED_SAMPLE, PID_RELATED_SAMPLE_OLD = 0x0083, 0x800F  # Fast DDS before 2.13 reads the old
-DISPOSED = 0b11  # in a status: bit 0 is disposed, bit 1 is unregistered
+PID_RELATED_SAMPLE, PID_RELATED_SAMPLE_OLD = 0x0083, 0x800F  # old: for Fast DDS before 2.13
+DISPOSED = 0b11  # status bits: 0 is disposed, 1 is unregistered
 
-WINDOW = 256  # numbers in a set of an ACKNACK or a GAP
-MAX_SEQUENCE = 1 << 62  # so that the next ones have room in their 64 bits
-MAX_PARAMETERS = 200  # of one list
+WINDOW = 256  # maximum size of a set of sequence numbers, in an ACKNACK or a GAP
+MAX_SEQUENCE = 1 << 62  # received; later numbers then also fit into 64 bits
+MAX_PARAMETERS = 200  # in one list
 HEADER_BYTES, MAX_SUBMESSAGES = 20, 64
 
 _DATA, _DATA_FRAG, _ACKNACK, _HEARTBEAT, _GAP = 0x15, 0x16, 0x06, 0x07, 0x08
@@ -28,11 +28,11 @@ _PAD, _INFO_TS, _INFO_SRC, _INFO_DST = 0x01, 0x09, 0x0C, 0x0E
 
 
 class BadMessage(ValueError):
-    """Bytes that are not RTPS."""
+    """Received bytes that are not valid RTPS."""
 
 
 class Sample(NamedTuple):
-    """Names one sample: the GUID of its writer and its sequence number."""
+    """The identity of a sample: the GUID of its writer and its sequence number."""
 
     guid: bytes
     seq: int
@@ -43,15 +43,15 @@ class Sample(NamedTuple):
 
 
 class Data(NamedTuple):
-    """One sample, or the disposal of an instance."""
+    """A DATA submessage: one sample, or the disposal of an instance."""
 
     reader: bytes  # entity id; UNKNOWN_ENTITY for all readers
     writer: bytes  # entity id
     seq: int
     payload: bytes = b""  # with its encapsulation header
-    related: Sample | None = None  # of a request: the reader that waits; of a reply: the request
+    related: Sample | None = None  # in a request: the client's reader; in a reply: the request
     status: int = 0  # DISPOSED for a disposal
-    key: bytes = b""  # key hash: the GUID of what discovery data describe
+    key: bytes = b""  # key hash; in discovery data, the GUID of the described entity
 
     def encode(self) -> bytes:
         """Return the submessage."""
@@ -62,15 +62,15 @@ class Data(NamedTuple):
 
 
 class DataFragments(NamedTuple):
-    """Some of the fragments of a sample."""
+    """A DATA_FRAG submessage: consecutive fragments of a sample."""
 
     reader: bytes
     writer: bytes
     seq: int
     first: int  # number of the first fragment, from 1
-    number: int  # of fragments here
-    fragment_bytes: int  # of each, except the last of the sample
-    sample_bytes: int
+    number: int  # count of fragments in this submessage
+    fragment_bytes: int  # size of each fragment, except the sample's last one
+    sample_bytes: int  # size of the whole sample
     payload: bytes
     related: Sample | None = None
 
@@ -85,39 +85,39 @@ class DataFragments(NamedTuple):
 
 
 class Heartbeat(NamedTuple):
-    """The range of samples that a writer has."""
+    """A HEARTBEAT submessage: the range of samples that a writer has."""
 
     reader: bytes
     writer: bytes
     first: int
-    last: int  # first - 1 for none
-    serial: int  # of this kind of submessage
-    final: bool = False  # no answer is wanted
+    last: int  # first - 1 if there are none
+    serial: int  # increases with each submessage of this kind
+    final: bool = False  # true: no answer is needed
 
     def encode(self) -> bytes:
         """Return the submessage."""
         body = self.reader + self.writer + _sequence(self.first) + _sequence(self.last)
-        return _submessage(_HEARTBEAT, 3 if self.final else 1, body + _count(self.serial))
+        return _submessage(_HEARTBEAT, 3 if self.final else 1, body + _serial(self.serial))
 
 
 class AckNack(NamedTuple):
-    """A reader has all samples below `base`, and asks for those of `missing`."""
+    """An ACKNACK submessage: a reader has all samples below `base`, and requests `missing`."""
 
     reader: bytes
     writer: bytes
     base: int
     missing: tuple[int, ...]
-    serial: int  # of this kind of submessage
-    final: bool = True  # no heartbeat is wanted
+    serial: int  # increases with each submessage of this kind
+    final: bool = True  # true: no heartbeat is needed
 
     def encode(self) -> bytes:
         """Return the submessage."""
         body = self.reader + self.writer + _sequence(self.base) + _bitmap(self.base, self.missing)
-        return _submessage(_ACKNACK, 3 if self.final else 1, body + _count(self.serial))
+        return _submessage(_ACKNACK, 3 if self.final else 1, body + _serial(self.serial))
 
 
 class Gap(NamedTuple):
-    """Samples from `start` to `base - 1`, and those of `others`, do not concern the reader."""
+    """A GAP submessage: samples `start` to `base - 1`, and `others`, are not for the reader."""
 
     reader: bytes
     writer: bytes
@@ -132,23 +132,23 @@ class Gap(NamedTuple):
 
 
 class NackFragments(NamedTuple):
-    """A reader asks for fragments of a sample."""
+    """A NACK_FRAG submessage: a reader requests fragments of a sample."""
 
     reader: bytes
     writer: bytes
     seq: int
     missing: tuple[int, ...]  # numbers of fragments, from 1
-    serial: int  # of this kind of submessage
+    serial: int  # increases with each submessage of this kind
 
     def encode(self) -> bytes:
         """Return the submessage."""
         base = self.missing[0]
         body = self.reader + self.writer + _sequence(self.seq) + struct.pack("<I", base)
-        return _submessage(_NACK_FRAG, 1, body + _bitmap(base, self.missing) + _count(self.serial))
+        return _submessage(_NACK_FRAG, 1, body + _bitmap(base, self.missing) + _serial(self.serial))
 
 
 class HeartbeatFragments(NamedTuple):
-    """A writer has the fragments of a sample up to `last`."""
+    """A HEARTBEAT_FRAG submessage: a writer has a sample's fragments up to `last`."""
 
     reader: bytes
     writer: bytes
@@ -159,16 +159,16 @@ class HeartbeatFragments(NamedTuple):
     def encode(self) -> bytes:
         """Return the submessage."""
         body = self.reader + self.writer + _sequence(self.seq) + struct.pack("<I", self.last)
-        return _submessage(_HEARTBEAT_FRAG, 1, body + _count(self.serial))
+        return _submessage(_HEARTBEAT_FRAG, 1, body + _serial(self.serial))
 
 
 Submessage = Data | DataFragments | Heartbeat | AckNack | Gap | NackFragments | HeartbeatFragments
 
 
 class Message(NamedTuple):
-    """A datagram's submessages that concern this participant."""
+    """The submessages of a datagram that are for this participant."""
 
-    prefix: bytes  # of the sender
+    prefix: bytes  # the sender's GUID prefix
     vendor: bytes
     submessages: list[Submessage]
 
@@ -185,9 +185,9 @@ def encode_message(prefix: bytes, to: bytes, submessages: Iterable[Submessage], 
 
 
 def decode_message(datagram: bytes, prefix: bytes) -> Message:
-    """Decode what a datagram has for the participant `prefix`, up to the first fault.
+    """Decode the submessages for the participant `prefix`, up to the first malformed one.
 
-    Raises BadMessage if its header is wrong.
+    Raises BadMessage if the header of the datagram is wrong.
     """
     if len(datagram) < HEADER_BYTES or datagram[:4] != b"RTPS" or datagram[4] != VERSION[0]:
         raise BadMessage("not an RTPS message")
@@ -200,10 +200,10 @@ def decode_message(datagram: bytes, prefix: bytes) -> Message:
         order = "<" if flags & 1 else ">"
         (size,) = struct.unpack_from(order + "H", datagram, at + 2)
         if not size and kind not in (_PAD, _INFO_TS):
-            size = len(datagram) - at - 4  # the last one may be longer than 64 kB
+            size = len(datagram) - at - 4  # 0 in the last one: up to the end, also above 64 kB
         body = datagram[at + 4 : at + 4 + size]
         at += 4 + (size + 3 & ~3)
-        if len(body) < size or kind == _INFO_SRC:  # nobody may speak for another here
+        if len(body) < size or kind == _INFO_SRC:  # no sender may act for another participant
             break
         if kind == _INFO_DST:
             ours = body in (prefix, bytes(12))
@@ -225,9 +225,9 @@ def encode_parameters(parameters: Iterable[tuple[int, bytes]]) -> bytes:
 
 
 def decode_parameters(order: str, data: bytes, at: int = 0) -> Iterator[tuple[int, bytes, int]]:
-    """Yield (id, value, offset behind it) of each parameter; the sentinel has no value.
+    """Yield (id, value, offset after it) of each parameter; the sentinel has no value.
 
-    Raises BadMessage for a list that ends too early.
+    Raises BadMessage for a list that ends early, or that is too long.
     """
     for _ in range(MAX_PARAMETERS):
         if at + 4 > len(data):
@@ -260,7 +260,7 @@ def _sequence(seq: int) -> bytes:
     return struct.pack("<iI", seq >> 32, seq & 0xFFFF_FFFF)
 
 
-def _count(serial: int) -> bytes:
+def _serial(serial: int) -> bytes:
     return struct.pack("<I", serial & 0x7FFF_FFFF)
 
 
@@ -287,7 +287,7 @@ def _read_sequence(order: str, body: bytes, at: int) -> int:
 
 
 def _read_bitmap(order: str, body: bytes, at: int, base: int) -> tuple[tuple[int, ...], int]:
-    """Return the numbers of a set, and the offset behind it."""
+    """Return the numbers of a set, and the offset after it."""
     (size,) = struct.unpack_from(order + "I", body, at)
     if size > WINDOW:
         raise BadMessage("too large a set")
@@ -296,48 +296,48 @@ def _read_bitmap(order: str, body: bytes, at: int, base: int) -> tuple[tuple[int
     return tuple(numbers), at + 4 + 4 * len(words)
 
 
-class _Inline(NamedTuple):
+class _InlineQos(NamedTuple):
     related: Sample | None
     status: int
     key: bytes
-    end: int
+    end: int  # offset of the payload
 
 
-def _read_inline(order: str, flags: int, body: bytes) -> _Inline:
+def _read_inline_qos(order: str, flags: int, body: bytes) -> _InlineQos:
     (skip,) = struct.unpack_from(order + "H", body, 2)
     related, status, key, end = None, 0, b"", 4 + skip
     if flags & 2:
-        for pid, value, behind in decode_parameters(order, body, end):
-            end = behind
+        for pid, value, after in decode_parameters(order, body, end):
+            end = after
             if pid in (PID_RELATED_SAMPLE, PID_RELATED_SAMPLE_OLD) and len(value) >= 24:
                 related = Sample(value[:16], _read_sequence(order, value, 16))
             elif pid == PID_STATUS_INFO and len(value) >= 4:
                 status = value[3] & DISPOSED
             elif pid == PID_KEY_HASH and len(value) >= 16:
                 key = value[:16]
-    return _Inline(related, status, key, end)
+    return _InlineQos(related, status, key, end)
 
 
-def _number(seq: int, least: int = 1) -> int:
-    if not least <= seq <= MAX_SEQUENCE:
-        raise BadMessage(f"sequence number {seq}: expected {least} to {MAX_SEQUENCE}")
+def _checked_sequence(seq: int, minimum: int = 1) -> int:
+    if not minimum <= seq <= MAX_SEQUENCE:
+        raise BadMessage(f"sequence number {seq}: expected {minimum} to {MAX_SEQUENCE}")
     return seq
 
 
 def _data(order: str, flags: int, body: bytes) -> Data:
-    seq = _number(_read_sequence(order, body, 12))
-    inline = _read_inline(order, flags, body)
+    seq = _checked_sequence(_read_sequence(order, body, 12))
+    inline = _read_inline_qos(order, flags, body)
     payload = body[inline.end :] if flags & 12 else b""
-    status = inline.status or (DISPOSED if flags & 8 else 0)  # only a key: gone
+    status = inline.status or (DISPOSED if flags & 8 else 0)  # flag 8: only a key
     return Data(body[4:8], body[8:12], seq, payload, inline.related, status, inline.key)
 
 
 def _data_fragments(order: str, flags: int, body: bytes) -> DataFragments:
-    seq = _number(_read_sequence(order, body, 12))
+    seq = _checked_sequence(_read_sequence(order, body, 12))
     first, count, fragment, sample = struct.unpack_from(order + "IHHI", body, 20)
     if not (first and count and fragment and sample and (first - 1) * fragment < sample):
         raise BadMessage("impossible fragments")
-    inline = _read_inline(order, flags, body)
+    inline = _read_inline_qos(order, flags, body)
     part = body[inline.end :]
     return DataFragments(
         body[4:8], body[8:12], seq, first, count, fragment, sample, part, inline.related
@@ -345,28 +345,28 @@ def _data_fragments(order: str, flags: int, body: bytes) -> DataFragments:
 
 
 def _heartbeat(order: str, flags: int, body: bytes) -> Heartbeat:
-    first = _number(_read_sequence(order, body, 8))
-    last = _number(_read_sequence(order, body, 16), first - 1)
+    first = _checked_sequence(_read_sequence(order, body, 8))
+    last = _checked_sequence(_read_sequence(order, body, 16), first - 1)
     (count,) = struct.unpack_from(order + "I", body, 24)
     return Heartbeat(body[:4], body[4:8], first, last, count, bool(flags & 2))
 
 
 def _acknack(order: str, flags: int, body: bytes) -> AckNack:
-    base = _read_sequence(order, body, 8)  # Fast DDS begins with 0
+    base = _read_sequence(order, body, 8)  # unchecked: Fast DDS begins with 0
     missing, at = _read_bitmap(order, body, 16, base)
     (count,) = struct.unpack_from(order + "I", body, at)
     return AckNack(body[:4], body[4:8], base, missing, count, bool(flags & 2))
 
 
 def _gap(order: str, flags: int, body: bytes) -> Gap:
-    start = _number(_read_sequence(order, body, 8))
-    base = _number(_read_sequence(order, body, 16))
+    start = _checked_sequence(_read_sequence(order, body, 8))
+    base = _checked_sequence(_read_sequence(order, body, 16))
     others, _ = _read_bitmap(order, body, 24, base)
     return Gap(body[:4], body[4:8], start, base, others)
 
 
 def _nack_fragments(order: str, flags: int, body: bytes) -> NackFragments:
-    seq = _number(_read_sequence(order, body, 8))
+    seq = _checked_sequence(_read_sequence(order, body, 8))
     (base,) = struct.unpack_from(order + "I", body, 16)
     missing, at = _read_bitmap(order, body, 20, base)
     (count,) = struct.unpack_from(order + "I", body, at)
@@ -374,7 +374,7 @@ def _nack_fragments(order: str, flags: int, body: bytes) -> NackFragments:
 
 
 def _heartbeat_fragments(order: str, flags: int, body: bytes) -> HeartbeatFragments:
-    seq = _number(_read_sequence(order, body, 8))
+    seq = _checked_sequence(_read_sequence(order, body, 8))
     last, count = struct.unpack_from(order + "II", body, 16)
     return HeartbeatFragments(body[:4], body[4:8], seq, last, count)
 

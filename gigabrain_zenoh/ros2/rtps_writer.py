@@ -1,7 +1,7 @@
 """Reliable writer of RTPS, as a state machine without sockets or clocks.
 
-Source: OMG DDSI-RTPS 2.3, chapter 8.4. Times are in seconds of any one clock. All memory is
-bounded, whatever a peer sends; a reader gets no more than the samples that it asked for.
+Source: OMG DDSI-RTPS 2.3, chapter 8.4. Times are in seconds of any monotonic clock. No peer can
+make it use unbounded memory, or send more samples than requested.
 """
 
 import itertools
@@ -23,15 +23,15 @@ from gigabrain_zenoh.ros2.rtps_wire import (
     Submessage,
 )
 
-Send = Callable[[bytes, Address, Iterable[Submessage]], None]  # to a prefix at an address
+Send = Callable[[bytes, Address, Iterable[Submessage]], None]  # (receiver's prefix, address, …)
 
-FRAGMENT_BYTES = 16_384  # of a sample that is longer than one datagram may be
-MAX_WHOLE_BYTES = 32_768
-MAX_HISTORY, MAX_HISTORY_BYTES = 512, 8 << 20  # of a writer
-HISTORY_S = 5.0  # a sample waits so long for a reader that is not there yet
-FIRST_HEARTBEAT_S, SLOWEST_HEARTBEAT_S = 0.05, 2.0
-RESEND_S = 0.01  # one sample is not sent again to one reader within this time
-MAX_RESEND_BYTES = 1 << 18  # in answer to one datagram; a reader that lacks more asks again
+FRAGMENT_BYTES = 16_384  # of a sample that is too long for one datagram
+MAX_WHOLE_BYTES = 32_768  # longer samples are sent in fragments
+MAX_HISTORY, MAX_HISTORY_BYTES = 512, 8 << 20  # of one writer
+HISTORY_S = 5.0  # a sample without a reader is kept for this time
+MIN_HEARTBEAT_S, MAX_HEARTBEAT_S = 0.05, 2.0  # period of heartbeats; it doubles
+MIN_RESEND_S = 0.01  # minimum time before a sample is sent to the same reader again
+MAX_RESEND_BYTES = 1 << 18  # in answer to one datagram; a reader then requests the rest
 
 
 @dataclass(slots=True, eq=False)
@@ -39,34 +39,34 @@ class _Written:
     """A sample in a writer's history."""
 
     data: Data
-    target: bytes  # beginning of the GUIDs of its readers: empty for all
-    at_s: float
+    target: bytes  # for readers whose GUID begins with this; empty: for all
+    written_s: float
 
 
 @dataclass(slots=True, eq=False)
 class _Reader:
-    """A remote reader, as its writer knows it."""
+    """A writer's state of one remote reader."""
 
     guid: bytes
     address: Address
-    start: int  # first sample that concerns it, except those for it alone
-    announced: int  # it knows about all samples up to this one
-    acked: int = 0  # it has all samples below this one
-    last: int = 0  # the newest sample for it
-    answered: bool = False  # it has sent an ACKNACK
-    wait_s: float = FIRST_HEARTBEAT_S
-    due_s: float = 0.0
-    sent_s: dict[int, float] = field(default_factory=dict)
+    start: int  # the first sample for all readers that it receives
+    announced: int  # samples up to this one were announced to it
+    acked: int = 0  # samples below this one are acknowledged
+    last: int = 0  # the newest sample for this reader
+    answered: bool = False  # true: it has sent an ACKNACK
+    wait_s: float = MIN_HEARTBEAT_S
+    due_s: float = 0.0  # time of the next heartbeat
+    sent_s: dict[int, float] = field(default_factory=dict)  # by sequence number
 
     @property
-    def waits(self) -> bool:
+    def needs_heartbeat(self) -> bool:
         return self.acked <= self.last or not self.answered
 
 
 class ReliableWriter:
     """A writer whose samples go to all matched readers, or to those with a given GUID.
 
-    With `transient_local`, readers that come later get all samples; a sample with a key replaces
+    With `transient_local`, late readers receive the whole history, in which a sample replaces
     the older one with the same key.
     """
 
@@ -84,11 +84,11 @@ class ReliableWriter:
             known.address = address
             return
         start = 1 if self._transient_local else self._last + 1
-        reader = _Reader(guid, address, start, announced=0, due_s=now + FIRST_HEARTBEAT_S)
+        reader = _Reader(guid, address, start, announced=0, due_s=now + MIN_HEARTBEAT_S)
         self.readers[guid] = reader
-        mine = [one for one in self._history.values() if self._concerns(one, reader)]
-        reader.last = mine[-1].data.seq if mine else 0
-        self._deliver(reader, mine, now)
+        samples = [each for each in self._history.values() if self._is_for(each, reader)]
+        reader.last = samples[-1].data.seq if samples else 0
+        self._deliver(reader, samples, now)
 
     def unmatch(self, guid: bytes) -> None:
         """Remove a remote reader."""
@@ -108,7 +108,7 @@ class ReliableWriter:
         self._last += 1
         data = Data(UNKNOWN_ENTITY, self.entity, self._last, payload, related, status, key)
         if key and self._transient_local:
-            for seq in [seq for seq, one in self._history.items() if one.data.key == key]:
+            for seq in [seq for seq, each in self._history.items() if each.data.key == key]:
                 self._forget(seq)
         self._history[self._last] = written = _Written(data, target, now)
         self._bytes += len(payload)
@@ -116,12 +116,12 @@ class ReliableWriter:
             self._forget(next(iter(self._history)))
         for reader in self._readers_of(target):
             reader.last = self._last
-            reader.wait_s, reader.due_s = FIRST_HEARTBEAT_S, now + FIRST_HEARTBEAT_S
+            reader.wait_s, reader.due_s = MIN_HEARTBEAT_S, now + MIN_HEARTBEAT_S
             self._deliver(reader, [written], now)
         return self._last
 
     def on_acknack(self, guid: bytes, ack: AckNack, now: float) -> None:
-        """Send a reader what it asks for."""
+        """Send the samples that a reader requests."""
         reader = self.readers.get(guid)
         if reader is None:
             return
@@ -130,68 +130,68 @@ class ReliableWriter:
         reader.acked = max(reader.acked, base)
         if not self._transient_local:
             self._forget_acked(reader)
-        asked = [seq for seq in ack.missing if 0 < seq <= self._last]
-        wanted, absent, size = [], [], 0
-        for seq in asked:
-            one = self._history.get(seq)
-            if one is None or not self._concerns(one, reader):
+        requested = [seq for seq in ack.missing if 0 < seq <= self._last]
+        samples, absent, size = [], [], 0
+        for seq in requested:
+            sample = self._history.get(seq)
+            if sample is None or not self._is_for(sample, reader):
                 absent.append(seq)
-            elif now - reader.sent_s.get(seq, -1.0) >= RESEND_S and size < MAX_RESEND_BYTES:
-                wanted.append(one)
-                size += len(one.data.payload)
+            elif now - reader.sent_s.get(seq, -1.0) >= MIN_RESEND_S and size < MAX_RESEND_BYTES:
+                samples.append(sample)
+                size += len(sample.data.payload)
         if absent:
-            self._to(reader, [self._gap(reader, absent[0], absent)])
-        if wanted:
-            self._deliver(reader, wanted, now)
-        elif not asked and not ack.final:
+            self._send_to(reader, [self._gap(reader, absent[0], absent)])
+        if samples:
+            self._deliver(reader, samples, now)
+        elif not requested and not ack.final:
             has_all = base > max(reader.last, reader.announced)
-            self._to(reader, [self._heartbeat(reader, final=has_all)])
+            self._send_to(reader, [self._heartbeat(reader, final=has_all)])
 
     def on_nack_fragments(self, guid: bytes, nack: NackFragments, now: float) -> None:
-        """Send fragments again."""
-        reader, one = self.readers.get(guid), self._history.get(nack.seq)
-        if reader is None or one is None or not self._concerns(one, reader):
+        """Send requested fragments again."""
+        reader, sample = self.readers.get(guid), self._history.get(nack.seq)
+        if reader is None or sample is None or not self._is_for(sample, reader):
             return
-        if now - reader.sent_s.get(nack.seq, -1.0) < RESEND_S:
+        if now - reader.sent_s.get(nack.seq, -1.0) < MIN_RESEND_S:
             return
         reader.sent_s[nack.seq] = now
-        parts = _fragments(one.data, reader.guid[12:])
+        parts = _fragments(sample.data, reader.guid[12:])
         wanted = (part for part in parts if part.first in nack.missing)
         for part in itertools.islice(wanted, MAX_RESEND_BYTES // FRAGMENT_BYTES):
-            self._to(reader, [part])
-        self._to(reader, [self._heartbeat(reader)])
+            self._send_to(reader, [part])
+        self._send_to(reader, [self._heartbeat(reader)])
 
     def tick(self, now: float) -> float:
-        """Send heartbeats that are due; return when the next one is due."""
+        """Send due heartbeats; return the time of the next one."""
         due = math.inf
         for reader in self.readers.values():
-            if not reader.waits:
+            if not reader.needs_heartbeat:
                 continue
             if now >= reader.due_s:
-                reader.wait_s = min(2 * reader.wait_s, SLOWEST_HEARTBEAT_S)
+                reader.wait_s = min(2 * reader.wait_s, MAX_HEARTBEAT_S)
                 reader.due_s = now + reader.wait_s
-                self._to(reader, [self._heartbeat(reader)])
+                self._send_to(reader, [self._heartbeat(reader)])
             due = min(due, reader.due_s)
         if not self._transient_local:
-            for seq in [s for s, one in self._history.items() if now - one.at_s > HISTORY_S]:
+            for seq in [s for s, each in self._history.items() if now - each.written_s > HISTORY_S]:
                 if not self._readers_of(self._history[seq].target):
                     self._forget(seq)
         return due
 
     @property
     def pending(self) -> int:
-        """Number of samples that are kept."""
+        """Number of samples in the history."""
         return len(self._history)
 
-    def _concerns(self, one: _Written, reader: _Reader) -> bool:
-        late = one.data.seq < reader.start and len(one.target) < 16
-        return reader.guid.startswith(one.target) and not late
+    def _is_for(self, sample: _Written, reader: _Reader) -> bool:
+        late = sample.data.seq < reader.start and len(sample.target) < 16
+        return reader.guid.startswith(sample.target) and not late
 
     def _readers_of(self, target: bytes) -> list[_Reader]:
         if len(target) == 16:
             reader = self.readers.get(target)
             return [reader] if reader else []
-        return [one for guid, one in self.readers.items() if guid.startswith(target)]
+        return [each for guid, each in self.readers.items() if guid.startswith(target)]
 
     def _forget(self, seq: int) -> None:
         self._bytes -= len(self._history.pop(seq).data.payload)
@@ -202,36 +202,39 @@ class ReliableWriter:
         for seq in [seq for seq in self._history if seq < reader.acked]:
             target = self._history[seq].target
             if reader.guid.startswith(target) and all(
-                seq < one.acked for one in self._readers_of(target)
+                seq < each.acked for each in self._readers_of(target)
             ):
                 self._forget(seq)
 
     def _deliver(self, reader: _Reader, samples: Iterable[_Written], now: float) -> None:
-        """Send samples in as few datagrams as possible, the last one with a heartbeat."""
+        """Send samples in as few datagrams as possible, and a heartbeat in the last one."""
         batch: list[Submessage] = []
         size, entity = 0, reader.guid[12:]
-        for one in samples:
-            data = one.data._replace(reader=entity)
+        for sample in samples:
+            data = sample.data._replace(reader=entity)
             if data.seq > reader.announced + 1 and not self._transient_local:
                 batch.append(Gap(entity, self.entity, reader.announced + 1, data.seq))
             reader.announced = max(reader.announced, data.seq)
             reader.sent_s[data.seq] = now
             if len(data.payload) > MAX_WHOLE_BYTES:
                 for part in _fragments(data, entity):
-                    self._to(reader, [part])
+                    self._send_to(reader, [part])
                 continue
             if batch and (size + len(data.payload) > MAX_WHOLE_BYTES or len(batch) > 16):
-                self._to(reader, batch)
+                self._send_to(reader, batch)
                 batch, size = [], 0
             batch.append(data)
             size += len(data.payload) + 100
-        self._to(reader, [*batch, self._heartbeat(reader)])
+        self._send_to(reader, [*batch, self._heartbeat(reader)])
 
     def _heartbeat(self, reader: _Reader, *, final: bool = False) -> Heartbeat:
         self._serial += 1
         last = max(reader.last, reader.announced)
-        mine = (s for s, one in self._history.items() if s <= last and self._concerns(one, reader))
-        first = min(mine, default=last + 1)
+        history = self._history.items()
+        first = min(
+            (seq for seq, each in history if seq <= last and self._is_for(each, reader)),
+            default=last + 1,
+        )
         return Heartbeat(reader.guid[12:], self.entity, first, last, self._serial, final)
 
     def _gap(self, reader: _Reader, start: int, absent: list[int]) -> Gap:
@@ -241,7 +244,7 @@ class ReliableWriter:
         others = tuple(seq for seq in absent if base <= seq < base + WINDOW)
         return Gap(reader.guid[12:], self.entity, start, base, others)
 
-    def _to(self, reader: _Reader, submessages: Iterable[Submessage]) -> None:
+    def _send_to(self, reader: _Reader, submessages: Iterable[Submessage]) -> None:
         self._send(reader.guid[:12], reader.address, submessages)
 
 
