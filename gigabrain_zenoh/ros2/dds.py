@@ -1,7 +1,7 @@
 """Transport to ROS nodes over DDS: topics by cyclonedds, services by a participant of their own.
 
-A thread waits until readers have something, and posts that to the loop; the loop then takes what
-a reader holds, at most its depth.
+A thread waits for readers with data, and posts a call to the event loop. The loop then takes the
+reader's samples, at most its depth at once.
 """
 
 import asyncio
@@ -59,7 +59,7 @@ from gigabrain_zenoh.ros2.types import Types
 log = logging.getLogger(__name__)
 ALL = SampleState.Any | ViewState.Any | InstanceState.Any
 FOREVER = duration(infinite=True)
-BLOCKING_MS = 1  # that a write waits for a slow reader, as it holds up the loop
+BLOCKING_MS = 1  # maximum wait of a write for a slow reader, because it blocks the event loop
 INFO_QOS = Qos(transient_local=True, depth=1)
 LOCALHOST = """<CycloneDDS><Domain Id="any">
 <General><Interfaces><NetworkInterface address="127.0.0.1"/></Interfaces>
@@ -70,48 +70,48 @@ LOCALHOST = """<CycloneDDS><Domain Id="any">
 </Domain></CycloneDDS>"""
 
 
-class _Waiting:
-    """Waits in a thread of its own for readers with data and writers whose readers changed.
+class _StatusWatcher:
+    """A thread that waits for readers with data, and for writers whose readers changed.
 
-    cyclonedds could call listeners instead, from its own threads. They would hold its locks while
-    they wait for Python's, and `ddspy_write` holds Python's while it waits for theirs.
+    Listeners of cyclonedds could deadlock: its threads would hold its locks while they wait for the
+    GIL, and `ddspy_write` holds the GIL while it waits for those locks.
     """
 
     def __init__(self, participant: DomainParticipant) -> None:
         self._set = WaitSet(participant)
         self._watched: dict[Entity, tuple[int, Callable[[], None]]] = {}
-        self._ended = GuardCondition(participant)
-        self._set.attach(self._ended)
+        self._closing = GuardCondition(participant)
+        self._set.attach(self._closing)
         self._thread = threading.Thread(target=self._run, name="dds", daemon=True)
         self._thread.start()
 
     def watch(self, entity: Entity, status: int, post: Callable[[], None]) -> None:
-        """Call `post`, in the thread, each time that the status is set. Calls it now as well."""
+        """Call `post` in the thread each time that the status is set, and once now."""
         entity.set_status_mask(status)
         self._watched = {**self._watched, entity: (status, post)}
         self._set.attach(entity)
         post()
 
     def forget(self, entity: Entity) -> None:
-        """Watch it no more."""
-        self._watched = {one: how for one, how in self._watched.items() if one is not entity}
+        """Stop watching an entity."""
+        self._watched = {each: how for each, how in self._watched.items() if each is not entity}
         self._set.detach(entity)
 
     def close(self) -> None:
         """End the thread."""
-        self._ended.set(True)
+        self._closing.set(True)
         self._thread.join()
 
     def _run(self) -> None:
-        while self._set.wait(FOREVER) and not self._ended.read():
+        while self._set.wait(FOREVER) and not self._closing.read():
             for entity, (status, post) in self._watched.items():
-                with contextlib.suppress(DDSException):  # it may be deleted meanwhile
+                with contextlib.suppress(DDSException):  # the entity may be deleted by now
                     if entity.take_status(status):
                         post()
 
 
 class DdsPublisher:
-    """A publisher: a writer of cyclonedds."""
+    """A publisher, which owns a writer of cyclonedds."""
 
     def __init__(self, home: "DdsTransport", writer: Any, on_readers: OnReaders | None) -> None:
         self.readers = 0
@@ -119,7 +119,7 @@ class DdsPublisher:
         self.gid: bytes = writer.guid.bytes
 
     def publish(self, payload: bytes) -> None:
-        """Send to all readers; a slow reliable reader can hold it up for a millisecond."""
+        """Send to all readers; a slow reliable reader can block it for BLOCKING_MS."""
         if self._writer and ddspy_write(self._writer._ref, payload) < 0:
             self._home.counts["not sent"] += 1
 
@@ -130,7 +130,7 @@ class DdsPublisher:
             self._home.remove(self, writer)
 
     def count(self) -> None:
-        """Count the readers."""
+        """Update the number of readers, and report a change."""
         if not self._writer:
             return
         readers = int(self._writer.get_publication_matched_status().current_count)
@@ -141,15 +141,15 @@ class DdsPublisher:
 
 
 class DdsSubscriber:
-    """A reader of cyclonedds."""
+    """A subscriber, which owns a reader of cyclonedds."""
 
     def __init__(self, home: "DdsTransport", reader: Any, depth: int, handle: OnReceived) -> None:
         self._home, self._reader, self._depth, self._handle = home, reader, depth, handle
-        self._gids: dict[int, bytes] = {}  # by the handle of a publisher
+        self._gids: dict[int, bytes] = {}  # ids of publishers by handle
         self.gid: bytes = reader.guid.bytes
 
     def take(self) -> bool:
-        """Hand over what the reader holds; return whether there may be more."""
+        """Deliver at most `depth` samples of the reader; return whether there may be more."""
         taken = ddspy_take(self._reader._ref, ALL, self._depth) if self._reader else ()
         if isinstance(taken, int):
             self._home.counts["not taken"] += 1
@@ -168,7 +168,7 @@ class DdsSubscriber:
 
     def _gid(self, handle: int) -> bytes:
         if handle not in self._gids:
-            if len(self._gids) >= MAX_DEPTH:  # of publishers that came and went
+            if len(self._gids) >= MAX_DEPTH:  # most are of publishers that no longer exist
                 self._gids.clear()
             found = self._reader.get_matched_publication_data(handle)
             self._gids[handle] = found.key.bytes if found else b""
@@ -185,9 +185,9 @@ class DdsTransport:
         self._info = DiscoveryInfo(link.distro)
         self._idl, self._info_idl = IdlTypes(types.fields), IdlTypes(self._info.fields_of)
         self._topics: dict[tuple[str, str], Any] = {}
-        self._mine: list[DdsPublisher | DdsSubscriber] = []
+        self._endpoints: list[DdsPublisher | DdsSubscriber] = []
         self._publishing = self._closed = False
-        self._kept: list[Entity] = []  # cyclonedds deletes what is not referenced
+        self._references: list[Entity] = []  # cyclonedds deletes entities without references
 
     async def __aenter__(self) -> "DdsTransport":
         self._loop = asyncio.get_running_loop()
@@ -213,18 +213,18 @@ class DdsTransport:
         self._bridge.close()
         self._closed = True
         await self._services.close()
-        await asyncio.to_thread(self._waiting.close)
-        await asyncio.to_thread(_delete, self._participant)  # and all that it has
+        await asyncio.to_thread(self._watcher.close)
+        await asyncio.to_thread(_delete, self._participant)  # and all its entities
 
     def publisher(
         self, topic: str, type: str, qos: Qos = DEFAULT, on_readers: OnReaders | None = None
     ) -> DdsPublisher:
-        """Declare a publisher. `on_readers` is called from the loop's next turn on."""
+        """Declare a publisher. `on_readers` is first called in a later turn of the loop."""
         writer = DataWriter(
             self._participant, self._topic(topic, type), dds_qos(qos, self.types.hash(type))
         )
         publisher = DdsPublisher(self, writer, on_readers)
-        self._waiting.watch(
+        self._watcher.watch(
             writer,
             DDSStatus.PublicationMatched,
             lambda: self._bridge.post(DdsPublisher.count, publisher),
@@ -233,7 +233,7 @@ class DdsTransport:
         return publisher
 
     def subscribe(self, topic: str, type: str, qos: Qos, handle: OnReceived) -> Close:
-        """Call `handle` for each message; a busy loop keeps the newest `qos.depth` messages."""
+        """Call `handle` for each message; up to `qos.depth` newest ones wait for a busy loop."""
         reader = DataReader(
             self._participant, self._topic(topic, type), dds_qos(qos, self.types.hash(type))
         )
@@ -268,21 +268,21 @@ class DdsTransport:
         """Return the names of all nodes in the domain."""
         return self._graph.nodes()
 
-    def remove(self, one: DdsPublisher | DdsSubscriber, entity: Entity) -> None:
-        """Delete an endpoint, in another thread: a writer waits for its readers a while."""
-        if self._closed:  # deleted with the participant
+    def remove(self, endpoint: DdsPublisher | DdsSubscriber, entity: Entity) -> None:
+        """Delete an endpoint in another thread, because a writer waits for its readers."""
+        if self._closed:  # it was deleted with the participant
             return
-        self._mine.remove(one)
-        self._waiting.forget(entity)
+        self._endpoints.remove(endpoint)
+        self._watcher.forget(entity)
         self._loop.run_in_executor(None, _delete, entity)
         self._publish_graph_soon()
 
     def _open(self) -> None:
         if self.link.localhost:
-            self._kept += _localhost(self.link.domain)
+            self._references += _localhost(self.link.domain)
         qos = DdsQos(Policy.Userdata(b"enclave=/;"))
         self._participant = DomainParticipant(self.link.domain, qos)
-        self._waiting = _Waiting(self._participant)
+        self._watcher = _StatusWatcher(self._participant)
         guid = self._participant.guid.bytes
         self._graph = DdsGraph(
             self._info, frozenset({guid[:12], self._services.participant.data.prefix})
@@ -292,21 +292,21 @@ class DdsTransport:
         self._watch(BuiltinTopicDcpsSubscription, lambda s: self._graph.endpoint(s, False))
         topic = Topic(self._participant, INFO_TOPIC, self._info_idl.struct(INFO_TYPE))
         hash = self.types.hash(INFO_TYPE)
-        self._teller = DataWriter(self._participant, topic, dds_qos(INFO_QOS, hash, own=True))
+        self._info_writer = DataWriter(self._participant, topic, dds_qos(INFO_QOS, hash, own=True))
         qos = dds_qos(INFO_QOS, hash, keep_all=True, own=True)
         reader = DataReader(self._participant, topic, qos)
         self._listen(reader, DdsSubscriber(self, reader, MAX_DEPTH, self._on_discovery).take)
-        self._kept += [topic, reader]
+        self._references += [topic, reader]
         self._publish_graph()
 
     def _watch(self, topic: Any, take: Callable[[Any], None]) -> None:
-        """Call `take` for each change that DDS knows of participants or endpoints."""
+        """Call `take` for each sample of a built-in topic: changes of participants or endpoints."""
         reader = BuiltinDataReader(self._participant, topic)
 
         def read() -> bool:
             try:
                 taken = reader.take(MAX_DEPTH)
-            except Exception as error:  # noqa: BLE001 - it has no class of its own for bad names
+            except Exception as error:  # noqa: BLE001 - a bad name raises a plain Exception
                 self.counts["malformed endpoint"] += 1
                 log.debug("an endpoint cannot be read: %s", error)
                 return False
@@ -315,11 +315,11 @@ class DdsTransport:
             return len(taken) == MAX_DEPTH
 
         self._listen(reader, read)
-        self._kept.append(reader)
+        self._references.append(reader)
 
     def _listen(self, reader: Entity, take: Callable[[], bool]) -> None:
         """Have the loop call `take` when a reader has data, and again while it returns True."""
-        self._waiting.watch(reader, DDSStatus.DataAvailable, _Once(self._bridge, take))
+        self._watcher.watch(reader, DDSStatus.DataAvailable, _PendingCall(self._bridge, take))
 
     def _on_discovery(self, received: Received) -> None:
         try:
@@ -338,12 +338,12 @@ class DdsTransport:
         halves = self.types.hash(f"{type}_Request"), self.types.hash(f"{type}_Response")
         return ServiceType(type, *halves)
 
-    def _add(self, one: DdsPublisher | DdsSubscriber) -> None:
-        self._mine.append(one)
+    def _add(self, endpoint: DdsPublisher | DdsSubscriber) -> None:
+        self._endpoints.append(endpoint)
         self._publish_graph_soon()
 
     def _publish_graph_soon(self) -> None:
-        """Tell the others our endpoints once this turn of the loop is over."""
+        """Announce our endpoints to other nodes in the next turn of the loop."""
         if not self._publishing:
             self._publishing = True
             self._loop.call_soon(self._publish_graph)
@@ -353,18 +353,18 @@ class DdsTransport:
         if self._closed:
             return
         readers, writers = self._services.gids()
-        readers += [each.gid for each in self._mine if isinstance(each, DdsSubscriber)]
-        writers += [each.gid for each in self._mine if isinstance(each, DdsPublisher)]
+        readers += [each.gid for each in self._endpoints if isinstance(each, DdsSubscriber)]
+        writers += [each.gid for each in self._endpoints if isinstance(each, DdsPublisher)]
         payload = self._info.encode(
             self._participant.guid.bytes, self.link.namespace, self.link.node, readers, writers
         )
-        ddspy_write(self._teller._ref, payload)
+        ddspy_write(self._info_writer._ref, payload)
 
 
-class _Once:
-    """Posts a call to the loop, unless one waits there already. From any thread.
+class _PendingCall:
+    """Posts a call to the loop, from any thread, unless the call is already pending.
 
-    Posts once more where the function returns True.
+    Posts it again if the function returns True.
     """
 
     def __init__(self, bridge: Bridge, function: Callable[[], bool]) -> None:
@@ -374,16 +374,16 @@ class _Once:
     def __call__(self) -> None:
         if not self._posted:
             self._posted = True
-            self._bridge.post(_Once._run, self)
+            self._bridge.post(_PendingCall._run, self)
 
     def _run(self) -> None:
-        self._posted = False  # before reading, so that what arrives from now on posts again
+        self._posted = False  # before reading, so that data that arrive from now on post a new call
         if self._function():
             self()
 
 
 def dds_qos(qos: Qos, hash: str, *, keep_all: bool = False, own: bool = False) -> DdsQos:
-    """Return cyclonedds's policies; with `own` an endpoint also meets those of its participant."""
+    """Return cyclonedds's policies; `own`: an endpoint also matches those of its participant."""
     return DdsQos(
         Policy.Reliability.Reliable(duration(milliseconds=BLOCKING_MS))
         if qos.reliable
@@ -398,12 +398,12 @@ def dds_qos(qos: Qos, hash: str, *, keep_all: bool = False, own: bool = False) -
 
 
 def _delete(entity: Any) -> None:
-    """Delete an entity and all below it, which references from elsewhere may not prevent."""
+    """Delete an entity and its children, even if references to them remain."""
     entity._delete(entity._ref)
 
 
 def _localhost(domain: int) -> list[Entity]:
-    """Keep a domain of this process to this host; the first who joins it decides."""
+    """Restrict a domain to this host, unless this process has already joined it."""
     try:
         return [Domain(domain, LOCALHOST)]
     except DDSException as error:

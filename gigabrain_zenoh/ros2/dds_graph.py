@@ -1,7 +1,7 @@
-"""The ROS graph over DDS: what DDS tells of endpoints, and what ROS nodes tell of themselves.
+"""The ROS graph over DDS: endpoints that DDS discovers, and nodes that participants announce.
 
-DDS knows participants; a participant tells on `ros_discovery_info` which nodes it holds, and which
-endpoints belong to them.
+DDS knows participants and endpoints, but no nodes. Each participant publishes its nodes and their
+endpoints on `ros_discovery_info`.
 """
 
 import logging
@@ -25,15 +25,15 @@ log = logging.getLogger(__name__)
 INFO_TOPIC = "ros_discovery_info"
 INFO_TYPE = "rmw_dds_common/msg/ParticipantEntitiesInfo"
 HASH = re.compile(rb"typehash=(RIHS01_[0-9a-f]{64});")
-MAX_NODES = 1000  # of a participant, and participants
+MAX_NODES = 1000  # of one participant; also the maximum number of participants
 GID_BYTES = 16
 
 
-class Seen(NamedTuple):
+class DiscoveredEndpoint(NamedTuple):
     """An endpoint as DDS describes it."""
 
-    writer: bool
-    participant: bytes  # its GUID, 16 bytes
+    writer: bool  # false: a reader
+    participant: bytes  # the GUID of its participant, 16 bytes
     topic: str  # rt/scan
     type: str  # sensor_msgs::msg::dds_::LaserScan_
     qos: Qos
@@ -48,7 +48,7 @@ class NodeEntities(NamedTuple):
 
 
 class DiscoveryInfo:
-    """The messages of `ros_discovery_info`. Up to Humble they have longer ids."""
+    """Encodes and decodes `ros_discovery_info`. Up to Humble, its ids have 24 bytes."""
 
     def __init__(self, distro: str) -> None:
         humble = distro == "humble"
@@ -56,7 +56,7 @@ class DiscoveryInfo:
         self._gid_bytes = 24 if humble else GID_BYTES
 
     def fields_of(self, name: str) -> Fields:
-        """Return the fields of the message's types."""
+        """Return the fields of a message type in `ros_discovery_info`."""
         fields: Fields = self._store.fielddefs[name][1]
         return fields
 
@@ -100,21 +100,21 @@ class DiscoveryInfo:
 
 
 class DdsGraph:
-    """The known endpoints and nodes: those of others, and our own."""
+    """All known endpoints and nodes, including our own."""
 
     def __init__(self, info: DiscoveryInfo, ours: frozenset[bytes]) -> None:
-        """Create an empty graph; `ours` are the GUIDs' first 12 bytes of our participants."""
+        """Create an empty graph; `ours` are the GUID prefixes (12 bytes) of our participants."""
         self._info, self._ours = info, ours
-        self._seen: dict[bytes, Seen] = {}  # by GUID
-        self._nodes: dict[bytes, tuple[NodeEntities, ...]] = {}  # by participant
+        self._discovered: dict[bytes, DiscoveredEndpoint] = {}  # by GUID
+        self._nodes: dict[bytes, tuple[NodeEntities, ...]] = {}  # by the GUID of the participant
 
     def endpoint(self, sample: Any, writer: bool) -> None:
-        """Take what DDS tells of an endpoint: it is there, or gone."""
+        """Add or remove an endpoint, as a built-in sample of DDS says."""
         guid = sample.key.bytes
         if sample.sample_info.instance_state != InstanceState.Alive or sample.qos is None:
-            self._seen.pop(guid, None)
+            self._discovered.pop(guid, None)
             return
-        self._seen[guid] = Seen(
+        self._discovered[guid] = DiscoveredEndpoint(
             writer,
             sample.participant_key.bytes,
             sample.topic_name or "",
@@ -124,12 +124,12 @@ class DdsGraph:
         )
 
     def participant(self, sample: Any) -> None:
-        """Take what DDS tells of a participant; the nodes of one that is gone are gone."""
+        """Remove the nodes of a participant that a built-in sample of DDS reports as gone."""
         if sample.sample_info.instance_state != InstanceState.Alive:
             self._nodes.pop(sample.key.bytes, None)
 
     def update(self, payload: bytes) -> None:
-        """Take a message of `ros_discovery_info`. Raises BadPayload."""
+        """Replace a participant's nodes by those of a `ros_discovery_info`. Raises BadPayload."""
         participant, nodes = self._info.decode(payload)
         if participant in self._nodes or len(self._nodes) < MAX_NODES:
             self._nodes[participant] = nodes
@@ -141,32 +141,32 @@ class DdsGraph:
         return tuple(node.name for nodes in self._nodes.values() for node in nodes)
 
     def endpoints(self) -> tuple[GraphEndpoint, ...]:
-        """Return all ROS endpoints; services once for each server and client."""
+        """Return all ROS endpoints. A server or client, which has two DDS endpoints, is one."""
         owners = {
             gid: node.name for nodes in self._nodes.values() for node in nodes for gid in node.gids
         }
         found = (
-            _endpoint(seen, owners.get(guid, ""), seen.participant[:12] in self._ours)
-            for guid, seen in self._seen.items()
+            _endpoint(each, owners.get(guid, ""), each.participant[:12] in self._ours)
+            for guid, each in self._discovered.items()
         )
         return tuple(each for each in found if each)
 
 
-def _endpoint(seen: Seen, node: str, ours: bool) -> GraphEndpoint | None:
-    """Return the ROS endpoint; None for what is none, and for the second half of a service."""
-    prefix, _, rest = seen.topic.partition("/")
-    topic, type = f"/{rest}", ros_type(seen.type)
-    kind: EndpointKind = "publisher" if seen.writer else "subscriber"
+def _endpoint(found: DiscoveredEndpoint, node: str, ours: bool) -> GraphEndpoint | None:
+    """Return the ROS endpoint; None for other DDS endpoints, and the replies of a service."""
+    prefix, _, rest = found.topic.partition("/")
+    topic, type = f"/{rest}", ros_type(found.type)
+    kind: EndpointKind = "publisher" if found.writer else "subscriber"
     if prefix == "rq" and topic.endswith("Request") and type.endswith("_Request"):
-        kind = "client" if seen.writer else "server"
+        kind = "client" if found.writer else "server"
         topic, type = topic.removesuffix("Request"), type.removesuffix("_Request")
     elif prefix != "rt" or not rest:
         return None
-    return GraphEndpoint(node, kind, topic, type, seen.hash, seen.qos, ours)
+    return GraphEndpoint(node, kind, topic, type, found.hash, found.qos, ours)
 
 
 def ros_qos(qos: DdsQos) -> Qos:
-    """Return the QoS of an endpoint. DDS's default history is of one message."""
+    """Return the QoS of an endpoint. The default history of DDS is one message."""
     history = qos[Policy.History]
     depth = getattr(history, "depth", MAX_DEPTH) if history else 1
     return Qos(

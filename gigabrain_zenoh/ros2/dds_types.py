@@ -1,7 +1,7 @@
-"""ROS types as cyclonedds knows them, made from the definitions of rosbags.
+"""Makes cyclonedds types from the ROS definitions of rosbags.
 
-Only their layout is used: cyclonedds checks received samples by it and announces it to peers that
-compare types. Samples go in and out as CDR.
+cyclonedds uses only their layout: to check received samples, and to announce it to peers that
+compare types. Samples are written and read as CDR.
 """
 
 from collections.abc import Callable
@@ -14,7 +14,7 @@ from rosbags.interfaces import Nodetype
 from gigabrain_zenoh.ros2.transport import dds_type
 from gigabrain_zenoh.ros2.type_files import Description, Fields
 
-of: Any = idl  # its array and sequence take types in brackets, though they are not generic
+of: Any = idl  # as Any: `of.array[type, size]` is valid, though mypy sees no generic type
 PRIMITIVES: dict[str, Any] = {
     "bool": bool,
     "char": idl.uint8,
@@ -34,26 +34,26 @@ PRIMITIVES: dict[str, Any] = {
 
 
 class IdlTypes:
-    """Makes each type once."""
+    """Makes cyclonedds types, each once."""
 
     def __init__(self, fields_of: Callable[[str], Fields]) -> None:
         self._fields_of = fields_of
-        self._made: dict[str, Any] = {}
+        self._structs: dict[str, Any] = {}
 
     def struct(self, name: str) -> Any:
-        """Return the type of a message. Raises what `fields_of` raises."""
-        if name not in self._made:
+        """Return the cyclonedds type of a message. Raises the errors of `fields_of`."""
+        if name not in self._structs:
             fields = {field: self._element(kind) for field, kind in self._fields_of(name)}
-            whole = dds_type(name).replace("::", ".")
-            self._made[name] = make_idl_struct(whole.rpartition(".")[2], whole, fields)
-        return self._made[name]
+            full_name = dds_type(name).replace("::", ".")
+            self._structs[name] = make_idl_struct(full_name.rpartition(".")[2], full_name, fields)
+        return self._structs[name]
 
     def _element(self, kind: Description) -> Any:
         if kind[0] == Nodetype.NAME:
             return self.struct(kind[1])
         if kind[0] == Nodetype.BASE:
-            primitive, longest = kind[1]
-            return of.bounded_str[longest] if longest else PRIMITIVES[primitive]
+            primitive, max_length = kind[1]
+            return of.bounded_str[max_length] if max_length else PRIMITIVES[primitive]
         inner, size = kind[1]
         element = self._element(inner)
         if kind[0] == Nodetype.ARRAY:

@@ -1,6 +1,6 @@
 """A network of ROS nodes inside this process, for tests: first in, first out, no clock.
 
-It matches as DDS does. Only the way is short: payloads are the same as on the wire.
+Endpoints match as in DDS, and payloads are the same as on the wire.
 """
 
 import asyncio
@@ -30,29 +30,29 @@ log = logging.getLogger(__name__)
 
 
 class MemoryEndpoint:
-    """One endpoint of a node on a MemoryNetwork; also its publisher, if it is one."""
+    """One endpoint of a node on a MemoryNetwork; a publisher is one of these as well."""
 
     def __init__(
         self, node: "MemoryTransport", kind: EndpointKind, topic: str, type: str, qos: Qos
     ) -> None:
         self.node, self.kind, self.topic, self.type, self.qos = node, kind, topic, type, qos
         self.gid = next(node.network.ids).to_bytes(16, "little")
-        self.kept: deque[Received] = deque(maxlen=qos.depth)  # for late readers
+        self.history: deque[Received] = deque(maxlen=qos.depth)  # for late readers
         self.on_readers: OnReaders | None = None
         self.handle: OnReceived | None = None
         self.answer: Answer | None = None
         self.readers = 0
 
     def publish(self, payload: bytes) -> None:
-        """Hand a copy to all matched readers."""
+        """Deliver to all matched readers."""
         received = Received(payload, self.node.network.now_ns(), self.gid)
         if self.qos.transient_local:
-            self.kept.append(received)
+            self.history.append(received)
         for reader in self.node.network.matching(self):
             self.node.network.post(reader, received)
 
     def close(self) -> None:
-        """Leave the network."""
+        """Remove the endpoint from its network."""
         self.node.network.leave(self)
 
 
@@ -73,25 +73,25 @@ class MemoryNetwork:
         return self.nodes[-1]
 
     def join(self, endpoint: MemoryEndpoint) -> None:
-        """Add an endpoint, match it, and hand over what publishers kept for it."""
+        """Add an endpoint, match it, and deliver the history of its publishers."""
         self.endpoints.append(endpoint)
-        self._count()
+        self._count_readers()
         if endpoint.kind != "subscriber" or not endpoint.qos.transient_local:
             return
         for writer in tuple(self.endpoints):
             if endpoint in self.matching(writer):
-                for received in writer.kept:
+                for received in writer.history:
                     self.post(endpoint, received)
 
     def leave(self, endpoint: MemoryEndpoint) -> None:
-        """Remove an endpoint; nothing happens if it has left."""
+        """Remove an endpoint. Does nothing if it is already removed."""
         with contextlib.suppress(ValueError):
             self.endpoints.remove(endpoint)
         endpoint.readers = 0
-        self._count()
+        self._count_readers()
 
     def matching(self, writer: MemoryEndpoint) -> list[MemoryEndpoint]:
-        """Return the readers of other nodes that a publisher reaches."""
+        """Return the matched subscribers, which are of other nodes; empty unless a publisher."""
         if writer.kind != "publisher":
             return []
         return [
@@ -104,7 +104,7 @@ class MemoryNetwork:
         ]
 
     def post(self, reader: MemoryEndpoint, received: Received) -> None:
-        """Deliver after the messages that are already queued."""
+        """Deliver a message after those in the queue."""
         self._queue.append((reader, received))
         if self._delivering:
             return
@@ -117,7 +117,7 @@ class MemoryNetwork:
         finally:
             self._delivering = False
 
-    def _count(self) -> None:
+    def _count_readers(self) -> None:
         for writer in tuple(self.endpoints):
             readers = len(self.matching(writer))
             if readers != writer.readers:
@@ -153,24 +153,24 @@ class MemoryTransport:
         self, topic: str, type: str, qos: Qos = DEFAULT, on_readers: OnReaders | None = None
     ) -> MemoryEndpoint:
         """Declare a publisher."""
-        made = self._endpoint("publisher", topic, type, qos)
-        made.on_readers = on_readers
-        self.network.join(made)
-        return made
+        publisher = self._endpoint("publisher", topic, type, qos)
+        publisher.on_readers = on_readers
+        self.network.join(publisher)
+        return publisher
 
     def subscribe(self, topic: str, type: str, qos: Qos, handle: OnReceived) -> Close:
-        """Call `handle` for each message, at once."""
-        made = self._endpoint("subscriber", topic, type, qos)
-        made.handle = handle
-        self.network.join(made)
-        return made.close
+        """Call `handle` synchronously for each message."""
+        subscriber = self._endpoint("subscriber", topic, type, qos)
+        subscriber.handle = handle
+        self.network.join(subscriber)
+        return subscriber.close
 
     def serve(self, service: str, type: str, handle: Answer) -> Close:
-        """Answer requests of a service."""
-        made = self._endpoint("server", service, type, SERVICES)
-        made.answer = handle
-        self.network.join(made)
-        return made.close
+        """Serve a service: `handle` returns the response to a request."""
+        server = self._endpoint("server", service, type, SERVICES)
+        server.answer = handle
+        self.network.join(server)
+        return server.close
 
     async def call(self, service: str, type: str, request: bytes, timeout_s: float) -> bytes:
         """Return the response of the service's server. Raises NoAnswer."""

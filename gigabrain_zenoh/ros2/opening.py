@@ -1,4 +1,4 @@
-"""Opens the transport that a configuration names; its libraries are imported then, not before."""
+"""Opens the configured transport, and imports its libraries only then."""
 
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
@@ -10,11 +10,11 @@ from gigabrain_zenoh.host.files import expanded
 from gigabrain_zenoh.ros2.transport import RosTransport
 from gigabrain_zenoh.ros2.types import Types
 
-ROUTER_S = 5.0  # how long a router may take to answer a tool
+ROUTER_S = 5.0  # a command's timeout for an answer of the router
 
 
 def load_types(link: Ros2Link) -> Types:
-    """Load all types, those of the user's files as well. Raises ConfigError."""
+    """Load all types, including the user's files. Raises ConfigError."""
     return Types(expanded(each) for each in link.types)
 
 
@@ -27,20 +27,20 @@ async def open_transport(
 ) -> AsyncIterator[RosTransport]:
     """Open a node, and close it at the end of the context.
 
-    `endpoint` is the deployment's own, for `rmw_zenoh` without a router of its own. With
-    `timeout_s` None it waits for a router as long as it takes. Raises ConfigError where a library
-    or the name of a router is missing, BusError where router or domain cannot be joined.
+    `rmw_zenoh` connects to `link.router`, or else to the deployment's `endpoint`. It waits for a
+    router for `timeout_s`; None: without limit. Raises ConfigError if a library or the name of
+    a router is missing, BusError if the router or domain cannot be joined.
     """
-    made: RosTransport
+    transport: RosTransport
     if link.transport == "dds":
         if not find_spec("cyclonedds"):
             raise ConfigError("transport: dds needs more: pip install 'gigabrain-zenoh[dds]'")
         from gigabrain_zenoh.ros2.dds import DdsTransport
 
-        async with DdsTransport(link, types) as made:
-            yield made
+        async with DdsTransport(link, types) as transport:
+            yield transport
     else:
         from gigabrain_zenoh.ros2.rmw_zenoh import RmwZenohTransport
 
-        async with RmwZenohTransport(link, types, endpoint, timeout_s) as made:
-            yield made
+        async with RmwZenohTransport(link, types, endpoint, timeout_s) as transport:
+            yield transport

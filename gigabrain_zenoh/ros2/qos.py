@@ -1,8 +1,8 @@
-"""Quality of service of ROS 2, as far as it decides whether messages arrive."""
+"""Quality of service of ROS 2: the policies that decide whether messages arrive."""
 
 from dataclasses import dataclass
 
-MAX_DEPTH = 1000  # messages that a publisher keeps for late readers, or a reader queues
+MAX_DEPTH = 1000  # messages in a publisher's history, or in a reader's queue
 
 
 @dataclass(frozen=True)
@@ -10,7 +10,7 @@ class Qos:
     """The QoS that a publisher offers, or that a subscriber requests."""
 
     reliable: bool = True
-    transient_local: bool = False  # a late reader gets the last `depth` messages
+    transient_local: bool = False  # a late reader receives the last `depth` messages
     depth: int = 10
 
     def __post_init__(self) -> None:
@@ -33,7 +33,7 @@ ACTION_STATUS = Qos(transient_local=True, depth=1)
 def mismatch(offered: Qos, requested: Qos) -> str:
     """Return why DDS does not match a publisher with a subscriber; empty if it does.
 
-    `rmw_zenoh` matches everything, but a reader of transient local data gets no old messages there.
+    `rmw_zenoh` always matches, but a volatile publisher has no old messages for a late reader.
     """
     if requested.reliable and not offered.reliable:
         return "the publisher is best effort, the subscriber wants reliable"

@@ -1,4 +1,4 @@
-"""Zenoh declarations as `rmw_zenoh` makes them: publishers and subscribers with a history."""
+"""Zenoh publishers and subscribers with a history, declared as `rmw_zenoh` declares them."""
 
 from collections.abc import Callable
 from typing import Any
@@ -14,8 +14,8 @@ REMOTE = zenoh.Locality.REMOTE
 def advanced_publisher(session: zenoh.Session, key: str, qos: Qos) -> Any:
     """Declare a publisher that keeps its last messages for late readers.
 
-    It has no heartbeat, by which readers notice that they missed the last message: Zenoh 1.10 ends
-    its task while it holds the GIL, and hangs where a callback waits for that.
+    It has no heartbeat, so a reader does not notice that it missed the last message. Zenoh 1.10
+    stops the heartbeat's task while holding the GIL, which hangs if a callback waits for the GIL.
     """
     return zenoh.ext.declare_advanced_publisher(
         session,
@@ -33,7 +33,7 @@ def advanced_publisher(session: zenoh.Session, key: str, qos: Qos) -> Any:
 def subscriber(
     session: zenoh.Session, key: str, qos: Qos, put: Callable[[zenoh.Sample], None]
 ) -> Any:
-    """Declare a subscriber; of transient local data one that asks for what it missed."""
+    """Declare a subscriber; a transient local one also requests the messages that it missed."""
     if not qos.transient_local:
         return session.declare_subscriber(key, put, allowed_origin=REMOTE)
     return zenoh.ext.declare_advanced_subscriber(

@@ -1,6 +1,6 @@
-"""Names and bytes of `rmw_zenoh`: keys, liveliness tokens, QoS texts, ids and attachments.
+"""Formats of `rmw_zenoh`: keys, liveliness tokens, QoS texts, ids and attachments.
 
-Read in ros2/rmw_zenoh (design document, `liveliness_utils.cpp`, `attachment_helpers.cpp`).
+Source: ros2/rmw_zenoh (design document, `liveliness_utils.cpp`, `attachment_helpers.cpp`).
 """
 
 import struct
@@ -21,9 +21,9 @@ CODES: dict[EndpointKind, str] = {
     "client": "SC",
 }
 KINDS = {code: kind for kind, code in CODES.items()}
-NO_HASH = "TypeHashNotSupported"  # of Humble, which never meets the others
+NO_HASH = "TypeHashNotSupported"  # on Humble, which cannot communicate with other releases
 DEFAULT_DEPTH = 42
-BEST_EFFORT, TRANSIENT_LOCAL = "2", "1"  # codes of rmw; the defaults are left out
+BEST_EFFORT, TRANSIENT_LOCAL = "2", "1"  # codes of rmw; default values are omitted
 NODE_PARTS, ENDPOINT_PARTS, QOS_PARTS = 9, 13, 6
 
 
@@ -33,7 +33,7 @@ def topic_key(domain: int, topic: str, type: str, hash: str) -> str:
 
 
 def qos_text(qos: Qos) -> str:
-    """Return the last part of a token. Parts that equal rmw's default are empty."""
+    """Return the last part of a token. Values that equal rmw's defaults are empty."""
     reliability = "" if qos.reliable else BEST_EFFORT
     durability = TRANSIENT_LOCAL if qos.transient_local else ""
     depth = "" if qos.depth == DEFAULT_DEPTH else str(qos.depth)
@@ -41,7 +41,7 @@ def qos_text(qos: Qos) -> str:
 
 
 def parse_qos(text: str) -> Qos:
-    """Read the last part of a token. Raises ValueError."""
+    """Parse the last part of a token. Raises ValueError."""
     parts = text.split(":")
     if len(parts) < QOS_PARTS:
         raise ValueError(f"QoS {text!r}: expected {QOS_PARTS} parts")
@@ -57,7 +57,7 @@ class NodeName(NamedTuple):
     """A node of a session."""
 
     domain: int
-    zid: str  # of its Zenoh session
+    zid: str  # id of its Zenoh session
     namespace: str  # / or /robot1
     name: str
 
@@ -68,7 +68,7 @@ class NodeName(NamedTuple):
 
     @property
     def token(self) -> str:
-        """Liveliness token of the node, which is the first in its session."""
+        """Liveliness token of the node, with the id 0 in its session."""
         return self._start(0, NODE)
 
     def endpoint_token(
@@ -113,43 +113,43 @@ def _plain(name: str) -> str:
 
 
 def gid_of(token: str) -> bytes:
-    """Return the id of an endpoint: 16 bytes."""
+    """Return the id (16 bytes) of the endpoint with this token."""
     return xxhash.xxh3_128_intdigest(token.encode()).to_bytes(16, "little")
 
 
-PLAIN = struct.Struct("<qqB16s")  # 33 bytes
-NAMED = struct.Struct("<16sq17sq12s16s")  # 77 bytes: 0.2.0 to 0.2.3 of Jazzy
-NAMES = (b"\x0fsequence_number", b"\x10source_timestamp", b"\x0asource_gid\x10")
+SHORT_FORM = struct.Struct("<qqB16s")  # 33 bytes
+LONG_FORM = struct.Struct("<16sq17sq12s16s")  # 77 bytes, in versions 0.2.0 to 0.2.3 of Jazzy
+FIELD_NAMES = (b"\x0fsequence_number", b"\x10source_timestamp", b"\x0asource_gid\x10")
 
 
 class Attachment(NamedTuple):
     """The attachment of a message, request or response: its number, time and sender."""
 
-    sequence: int  # from 1
+    sequence: int  # counts from 1
     source_ns: int  # [ns], Unix time
-    gid: bytes  # 16 bytes, of the publisher or client
-    named: bool = False  # of the long form
+    gid: bytes  # 16 bytes, id of the publisher or client
+    named: bool = False  # true: the long form, with field names
 
     def to_bytes(self) -> bytes:
-        """Return the bytes, in the form that it came in."""
+        """Encode in the short or long form."""
         if not self.named:
-            return PLAIN.pack(self.sequence, self.source_ns, 16, self.gid)
-        sequence, stamp, gid = NAMES
-        return NAMED.pack(sequence, self.sequence, stamp, self.source_ns, gid, self.gid)
+            return SHORT_FORM.pack(self.sequence, self.source_ns, 16, self.gid)
+        sequence, stamp, gid = FIELD_NAMES
+        return LONG_FORM.pack(sequence, self.sequence, stamp, self.source_ns, gid, self.gid)
 
     def answered(self) -> "Attachment":
-        """Return the attachment of the response to this request."""
+        """Return the attachment for the response to this request."""
         return self._replace(source_ns=time.time_ns())
 
 
 def parse_attachment(data: bytes) -> Attachment:
-    """Read an attachment of either form. Raises ValueError."""
-    if len(data) == PLAIN.size:
-        sequence, source_ns, size, gid = PLAIN.unpack(data)
+    """Parse an attachment in either form. Raises ValueError."""
+    if len(data) == SHORT_FORM.size:
+        sequence, source_ns, size, gid = SHORT_FORM.unpack(data)
         if size == 16:
             return Attachment(sequence, source_ns, gid)
-    elif len(data) == NAMED.size:
-        first, sequence, second, source_ns, third, gid = NAMED.unpack(data)
-        if (first, second, third) == NAMES:
+    elif len(data) == LONG_FORM.size:
+        first, sequence, second, source_ns, third, gid = LONG_FORM.unpack(data)
+        if (first, second, third) == FIELD_NAMES:
             return Attachment(sequence, source_ns, gid, named=True)
     raise ValueError(f"attachment of {len(data)} bytes: expected 33 or 77 in rmw_zenoh's form")

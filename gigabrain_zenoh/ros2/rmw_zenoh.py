@@ -1,8 +1,8 @@
 """Transport to ROS nodes that use `rmw_zenoh`, over a router.
 
-A client session, as ROS nodes are peers and a router forwards nothing between peers. Tokens and
-declarations are made again on each new session, so nodes find each other after the router's
-restart.
+The session is a client: ROS nodes are peers, and a router forwards nothing between peers. All
+declarations are repeated on each new session, so nodes find each other after a restart of the
+router.
 """
 
 import asyncio
@@ -55,12 +55,12 @@ from gigabrain_zenoh.ros2.transport import (
 from gigabrain_zenoh.ros2.types import Types
 
 log = logging.getLogger(__name__)
-PATIENCE_S = 2.0  # how long the router may be missing before a warning is logged
-RETRY_S = 0.1  # until a service is asked again that no node serves yet
+WARN_AFTER_S = 2.0  # without a router, then a warning is logged
+RETRY_S = 0.1  # between two queries of a service that no node serves yet
 
 
 class _Entity:
-    """The key of an endpoint of ours, and its token in a session."""
+    """The key of one of our endpoints, and its token in each session."""
 
     def __init__(
         self, home: "RmwZenohTransport", kind: EndpointKind, topic: str, type: str, qos: Qos
@@ -74,19 +74,19 @@ class _Entity:
         self._sequence = count(1)
 
     def declare_token(self, line: OpenSession) -> Any:
-        """Announce the endpoint on a session, after which its id is known."""
+        """Announce the endpoint on a session, and set `gid`."""
         node = self._home.name_in(line.session)
         token = node.endpoint_token(self._id, self.kind, self.topic, self.type, self.hash, self.qos)
         self.gid = gid_of(token)
         return line.session.liveliness().declare_token(token)
 
     def attachment(self) -> bytes:
-        """Return the attachment of the next message or request."""
+        """Return the attachment for the next message or request."""
         return Attachment(next(self._sequence), time.time_ns(), self.gid).to_bytes()
 
 
 class RmwZenohPublisher:
-    """A publisher, on one session after another."""
+    """A publisher, which is declared again on each new session."""
 
     def __init__(
         self, home: "RmwZenohTransport", entity: _Entity, on_readers: OnReaders | None
@@ -99,10 +99,7 @@ class RmwZenohPublisher:
         self._close = home.lines.declare(self._declare)
 
     def publish(self, payload: bytes) -> None:
-        """Send to all readers. Without a session there are none, and only a late reader misses it.
-
-        A congested link drops the message.
-        """
+        """Send to all readers. Without a session, or on a congested link, nothing is sent."""
         if self._put:
             self._put(payload, attachment=self.entity.attachment())
 
@@ -113,29 +110,30 @@ class RmwZenohPublisher:
         self._close()
 
     def lost(self) -> None:
-        """Forget the readers, as the session is lost."""
+        """Forget the readers, because the session is lost."""
         self.release()
         self._matched = False
         self.count()
 
     def release(self) -> None:
-        """Send no more: what is declared on the session is about to be dropped."""
+        """Stop sending, because the declarations of the session are about to be dropped."""
         self._put = None
 
     def count(self) -> None:
-        """Count the readers: those with a token, and one at least if Zenoh knows of any.
+        """Update the number of readers, and report a change.
 
-        Zenoh also counts a subscriber of our own, though no message goes there.
+        Readers are counted by their tokens. If Zenoh matches a subscriber without a token, there is
+        one, unless it may be a subscriber of our own, which receives nothing.
         """
-        least = 0 if self._home.hears(self.entity.key) else 1
-        readers = max(least, self._home.readers_of(self.entity)) if self._matched else 0
+        minimum = 0 if self._home.subscribes(self.entity.key) else 1
+        readers = max(minimum, self._home.readers_of(self.entity)) if self._matched else 0
         if readers != self.readers:
             self.readers = readers
             if self._on_readers:
                 self._on_readers(readers)
 
     def _declare(self, line: OpenSession) -> Bundle:
-        """Declare; of an advanced publisher a plain one beside it tells the readers."""
+        """Declare; an advanced publisher also needs a plain one, which reports matching readers."""
         entity, session = self.entity, line.session
         plain = session.declare_publisher(
             entity.key,
@@ -172,13 +170,13 @@ class RmwZenohTransport:
         endpoint: Endpoint | None = None,
         timeout_s: float | None = None,
     ) -> None:
-        """Prepare; `endpoint` is the deployment's own, used if `link` names no router.
+        """Prepare. `endpoint` is the deployment's router, used if `link` names no router.
 
-        With `timeout_s` None it waits for the router as long as it takes.
+        Opening waits for the router for `timeout_s`; None: without limit.
         """
         self.link, self.types, self._timeout_s = link, types, timeout_s
         self.counts: Counter[str] = Counter()
-        self.ids = count(1)  # of endpoints; 0 is the node's
+        self.ids = count(1)  # for endpoints; the node has the id 0
         self.publishers: set[RmwZenohPublisher] = set()
         self.subscribers: set[_Entity] = set()
         self.endpoint = _endpoint(link, endpoint)
@@ -215,14 +213,14 @@ class RmwZenohTransport:
         return made
 
     def subscribe(self, topic: str, type: str, qos: Qos, handle: OnReceived) -> Close:
-        """Call `handle` for each message; a busy loop keeps the newest `qos.depth` messages."""
+        """Call `handle` for each message; up to `qos.depth` newest ones wait for a busy loop."""
         entity = _Entity(self, "subscriber", topic, type, qos)
 
         def deliver(sample: zenoh.Sample) -> None:
             if sample.kind == zenoh.SampleKind.PUT:
-                known = self._attachment(sample.attachment, entity.topic)
-                source_ns, gid = (known.source_ns, known.gid) if known else (None, b"")
-                number = known.sequence if known else None
+                found = self._attachment(sample.attachment, entity.topic)
+                source_ns, gid = (found.source_ns, found.gid) if found else (None, b"")
+                number = found.sequence if found else None
                 handle(Received(sample.payload.to_bytes(), source_ns, gid, number))
 
         mailbox = Mailbox(self.bridge, deliver, qos.depth)
@@ -246,8 +244,8 @@ class RmwZenohTransport:
         fault = QuietFault(log)
 
         async def run(query: zenoh.Query) -> None:
-            with query:  # released at the end, else the client waits for its timeout
-                known = self._attachment(query.attachment, entity.topic)
+            with query:  # releases the query at the end; otherwise the client waits for its timeout
+                found = self._attachment(query.attachment, entity.topic)
                 request = query.payload.to_bytes() if query.payload else b""
                 try:
                     response = await handle(request)
@@ -255,8 +253,8 @@ class RmwZenohTransport:
                     fault.begin(f"{entity.topic}: no answer: {error}", time.monotonic_ns())
                     return
                 fault.end(f"{entity.topic} answers again", time.monotonic_ns())
-                attachment = known.answered().to_bytes() if known else None
-                with contextlib.suppress(zenoh.ZError):  # the client's session is lost
+                attachment = found.answered().to_bytes() if found else None
+                with contextlib.suppress(zenoh.ZError):  # if the client's session is lost
                     query.reply(entity.key, response, attachment=attachment)
 
         put, ends = self._questions.serve(run, urgent=False)
@@ -278,7 +276,7 @@ class RmwZenohTransport:
     async def call(self, service: str, type: str, request: bytes, timeout_s: float) -> bytes:
         """Return the response of the service's server, waiting for it to appear.
 
-        Raises NoAnswer. A server that a token names is asked once only.
+        A server that is already in the graph is queried only once. Raises NoAnswer.
         """
         client = self._client(service, type)
         end_s = time.monotonic() + timeout_s
@@ -308,12 +306,12 @@ class RmwZenohTransport:
         link = self.link
         return NodeName(link.domain, str(session.zid()), link.namespace, link.node)
 
-    def hears(self, key: str) -> bool:
-        """Return whether a subscriber of ours is on the key."""
+    def subscribes(self, key: str) -> bool:
+        """Return whether a subscriber of our own has this key."""
         return any(each.key == key for each in self.subscribers)
 
     def readers_of(self, entity: _Entity) -> int:
-        """Count the subscribers of others on the key of a publisher."""
+        """Return the number of other nodes' subscribers that match a publisher."""
         hash = "" if entity.hash == NO_HASH else entity.hash
         return sum(
             each.kind == "subscriber"
@@ -323,10 +321,10 @@ class RmwZenohTransport:
         )
 
     async def _session(self) -> zenoh.Session:
-        """Open the first session. Raises BusError without a router in time."""
+        """Open the first session. Raises BusError if no router answers within the timeout."""
         opening = asyncio.ensure_future(open_session(self.endpoint))
         try:
-            done, _ = await asyncio.wait((opening,), timeout=self._timeout_s or PATIENCE_S)
+            done, _ = await asyncio.wait((opening,), timeout=self._timeout_s or WARN_AFTER_S)
             if not done:
                 where = ", ".join(self.endpoint.connect)
                 text = f"no router answers at {where}; start it, or correct `router`"
@@ -342,17 +340,18 @@ class RmwZenohTransport:
         liveliness = line.session.liveliness()
 
         def on_token(sample: zenoh.Sample) -> None:
-            there = sample.kind == zenoh.SampleKind.PUT
-            self.bridge.post(self._token, (str(sample.key_expr), there, name.zid))
+            alive = sample.kind == zenoh.SampleKind.PUT
+            self.bridge.post(self._on_token, (str(sample.key_expr), alive, name.zid))
 
         watch = liveliness.declare_subscriber(
             f"{SPACE}/{name.domain}/**", line.guard(on_token), history=True
         )
         return Bundle(watch, liveliness.declare_token(name.token))
 
-    def _token(self, change: tuple[str, bool, str]) -> None:
-        key, there, zid = change
-        if not there:
+    def _on_token(self, change: tuple[str, bool, str]) -> None:
+        """Update the graph by a change of a token: (key, whether it is alive, our session's id)."""
+        key, alive, zid = change
+        if not alive:
             self._graph.pop(key, None)
         else:
             try:
@@ -371,7 +370,7 @@ class RmwZenohTransport:
             publisher.lost()
 
     def _attachment(self, data: zenoh.ZBytes | None, topic: str) -> Attachment | None:
-        """Return what came with a message; without it, only sender and time are unknown."""
+        """Parse a message's attachment; None if it is missing or malformed, which is counted."""
         reason, text = "missing attachment", "ROS nodes would drop this message"
         if data is not None:
             try:
@@ -384,7 +383,7 @@ class RmwZenohTransport:
         return None
 
     def _client(self, service: str, type: str) -> _Entity:
-        """Return the client of a service; a new one is announced."""
+        """Return the client of a service, and declare it at the first use."""
         key = (absolute(service, self.link.namespace), type)
         if key not in self._clients:
             entity = _Entity(self, "client", service, type, SERVICES)
@@ -401,12 +400,12 @@ class RmwZenohTransport:
     async def _ask(
         self, line: OpenSession, client: _Entity, request: bytes, timeout_s: float
     ) -> bytes | None:
-        """Query the servers, and return the first response; None if there is none."""
-        answered: asyncio.Future[bytes | None] = asyncio.get_running_loop().create_future()
+        """Query the servers; return the first response, or None without one."""
+        first_response: asyncio.Future[bytes | None] = asyncio.get_running_loop().create_future()
 
         def settle(response: bytes | None) -> None:
-            if not answered.done():
-                answered.set_result(response)
+            if not first_response.done():
+                first_response.set_result(response)
 
         def on_reply(reply: zenoh.Reply) -> None:
             if reply.ok is not None:
@@ -428,13 +427,13 @@ class RmwZenohTransport:
         except zenoh.ZError as error:  # the session has just been closed
             log.debug("no query was sent on %s: %s", client.key, error)
             return None
-        with contextlib.suppress(TimeoutError):  # the session was lost, and the handler with it
-            return await asyncio.wait_for(answered, timeout_s + RETRY_S)
+        with contextlib.suppress(TimeoutError):  # the handler is lost with its session
+            return await asyncio.wait_for(first_response, timeout_s + RETRY_S)
         return None
 
 
 def _endpoint(link: Ros2Link, own: Endpoint | None) -> Endpoint:
-    """Return the way to the router. ROS's keys are outside of any robot's namespace."""
+    """Return the router's endpoint, without a namespace: keys of ROS have no robot's prefix."""
     if link.router:
         keys = own.keys if own else ""
         return Endpoint(connect=(link.router,), keys=keys, stamps=True)
@@ -444,5 +443,5 @@ def _endpoint(link: Ros2Link, own: Endpoint | None) -> Endpoint:
 
 
 def _drop(query: zenoh.Query) -> None:
-    """Release a query without an answer, because too many are waiting."""
+    """Release a query without an answer, because too many queries are waiting."""
     query.drop()

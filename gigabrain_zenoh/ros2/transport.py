@@ -1,7 +1,7 @@
 """Interface of the transports to ROS 2, and the names that both use.
 
-Payloads are CDR with the header of 4 bytes, as `Types.encode` makes them. Everything runs on the
-event loop's thread. Nothing that a transport publishes reaches its own subscriptions.
+Payloads are CDR with its 4-byte header, as `Types.encode` returns them. All methods and callbacks
+run on the event loop's thread. A transport does not receive its own messages.
 """
 
 import re
@@ -14,18 +14,18 @@ from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.ros2.qos import DEFAULT, Qos
 
 Close = Callable[[], None]  # may be called twice
-OnReaders = Callable[[int], None]  # number of matched readers of others
-Answer = Callable[[bytes], Awaitable[bytes]]  # request to response, both CDR
+OnReaders = Callable[[int], None]  # called with the number of matched readers of other nodes
+Answer = Callable[[bytes], Awaitable[bytes]]  # from request to response, both CDR
 EndpointKind = Literal["publisher", "subscriber", "server", "client"]
 
 
 class Received(NamedTuple):
     """One message of a topic."""
 
-    payload: bytes  # CDR; may have a tail
-    source_ns: int | None  # [ns] Unix time of its publication, by the publisher's clock
-    gid: bytes  # of the publisher: 16 bytes; empty if unknown
-    number: int | None = None  # by the publisher; None where a transport keeps the order itself
+    payload: bytes  # CDR; unknown bytes may follow it
+    source_ns: int | None  # [ns] Unix time of publication, by the publisher's clock
+    gid: bytes  # the publisher's id, 16 bytes; empty if unknown
+    number: int | None = None  # the publisher's count; None if the transport keeps the order
 
 
 OnReceived = Callable[[Received], None]
@@ -37,11 +37,11 @@ class GraphEndpoint:
 
     node: str  # fully qualified: /robot1/talker; empty if unknown
     kind: EndpointKind
-    topic: str  # fully qualified; of servers and clients the service
+    topic: str  # fully qualified; the service, for servers and clients
     type: str  # std_msgs/msg/String, std_srvs/srv/SetBool
-    hash: str  # RIHS01_…; empty where the other side tells none
+    hash: str  # RIHS01_…; empty if the other node sends none
     qos: Qos
-    ours: bool  # made by this transport
+    ours: bool  # true: created by this transport
 
 
 class RosPublisher(Protocol):
@@ -49,11 +49,11 @@ class RosPublisher(Protocol):
 
     @property
     def readers(self) -> int:
-        """Number of matched readers of others. At 0 nothing has to be encoded."""
+        """Number of matched readers of other nodes. At 0, skip encoding and publishing."""
         ...
 
     def publish(self, payload: bytes) -> None:
-        """Send to all readers, without waiting for any."""
+        """Send to all readers, without waiting for them."""
         ...
 
     def close(self) -> None:
@@ -64,22 +64,23 @@ class RosPublisher(Protocol):
 class RosServer(Protocol):
     """Offers topics and services.
 
-    Both are absolute (`/scan`) or relative to the node's namespace (`scan`). Types are
-    `std_msgs/msg/String` or `std_srvs/srv/SetBool`.
+    Names are absolute (`/scan`) or relative to the node's namespace (`scan`). Types are written
+    as `std_msgs/msg/String` or `std_srvs/srv/SetBool`.
     """
 
-    counts: Counter[str]  # what was refused or lost, by reason
+    counts: Counter[str]  # numbers of rejected or lost messages, by reason
 
     def publisher(
         self, topic: str, type: str, qos: Qos = DEFAULT, on_readers: OnReaders | None = None
     ) -> RosPublisher:
-        """Declare a publisher. `on_readers` gets the number of readers at each change."""
+        """Declare a publisher. `on_readers` is called when the number of readers changes."""
         ...
 
     def serve(self, service: str, type: str, handle: Answer) -> Close:
         """Answer requests of a service, each in a task of its own.
 
-        A GigabrainError of `handle` is logged, and the client gets no answer: ROS has no other way.
+        A GigabrainError of `handle` is logged, and the client gets no answer, because a ROS
+        response cannot carry an error.
         """
         ...
 
@@ -88,7 +89,7 @@ class RosTransport(RosServer, Protocol):
     """One ROS node on a transport."""
 
     def subscribe(self, topic: str, type: str, qos: Qos, handle: OnReceived) -> Close:
-        """Call `handle` for each message; a busy loop keeps the newest `qos.depth` messages."""
+        """Call `handle` for each message; up to `qos.depth` newest ones wait for a busy loop."""
         ...
 
     async def call(self, service: str, type: str, request: bytes, timeout_s: float) -> bytes:
@@ -96,11 +97,11 @@ class RosTransport(RosServer, Protocol):
         ...
 
     def endpoints(self) -> tuple[GraphEndpoint, ...]:
-        """Return the graph: endpoints of all nodes, ours as well."""
+        """Return the endpoints of all nodes, including this one."""
         ...
 
     def nodes(self) -> tuple[str, ...]:
-        """Return the fully qualified names of all nodes, ours as well."""
+        """Return the fully qualified names of all nodes, including this one."""
         ...
 
 
@@ -109,7 +110,7 @@ TYPE = re.compile(r"[a-z]\w*/(msg|srv|action)/[A-Za-z]\w*", re.ASCII)
 
 
 def absolute(name: str, namespace: str) -> str:
-    """Return a topic or service with a leading slash. Raises ConfigError for an invalid name.
+    """Return the absolute name of a topic or service. Raises ConfigError for an invalid name.
 
     >>> absolute("scan", "/robot1")
     '/robot1/scan'
@@ -133,7 +134,7 @@ def dds_type(name: str) -> str:
 
 
 def ros_type(name: str) -> str:
-    """Return the type of a name on the wire; the name itself if it is of another form."""
+    """Return the ROS type of a DDS type name; the name itself if it has another form."""
     parts = name.split("::")
     if len(parts) != 4 or parts[2] != "dds_" or not parts[3].endswith("_"):
         return name

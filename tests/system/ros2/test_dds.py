@@ -54,7 +54,7 @@ async def test_where_many_have_joined_it_stays_on_the_loopback_or_is_refused(tak
                 probe.bind(("127.0.0.1", last))
 
 
-@pytest.mark.parametrize("part", ["Bridge", "_Waiting"])
+@pytest.mark.parametrize("part", ["Bridge", "_StatusWatcher"])
 async def test_where_it_cannot_be_opened_nothing_is_left(
     monkeypatch: pytest.MonkeyPatch, part: str
 ) -> None:

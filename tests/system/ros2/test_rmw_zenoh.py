@@ -271,7 +271,7 @@ async def test_a_closed_node_keeps_no_publisher_that_a_callback_could_drop(
 async def test_a_router_that_is_not_there_is_named_and_waited_for(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr(rmw_zenoh, "PATIENCE_S", 0.05)
+    monkeypatch.setattr(rmw_zenoh, "WARN_AFTER_S", 0.05)
     here = free_endpoint()
     link = Ros2Link(router=here)
     with pytest.raises(BusError, match=f"^no router answers at {here}; start it, or correct"):
