@@ -1,6 +1,6 @@
-"""The wire of ROS 2: its types, its QoS, and two transports, `rmw_zenoh` and `dds`. A library.
+"""Connects to ROS 2: message types, QoS, and two transports, `rmw_zenoh` and `dds`.
 
-It may import bus, config and host; zenoh, rosbags and cyclonedds are imported here only.
+It may import bus, config and host. Only this room imports rosbags and cyclonedds.
 The gateway, drivers of ROS 2 robots, commands and qa may import it. It knows no robot.
 """
 

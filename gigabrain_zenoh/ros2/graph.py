@@ -1,4 +1,4 @@
-"""The ROS graph: waits until it is known, and finds what keeps its endpoints apart."""
+"""The ROS graph: waits for its discovery, and finds endpoints that cannot communicate."""
 
 import asyncio
 from collections import defaultdict
@@ -9,56 +9,57 @@ from gigabrain_zenoh.config.settings import Ros2Link
 from gigabrain_zenoh.ros2.qos import mismatch
 from gigabrain_zenoh.ros2.transport import EndpointKind, GraphEndpoint
 
-CLOCK_S = 1.0  # by which clocks may differ
+CLOCK_S = 1.0  # tolerated difference between two machines' clocks
 SYNCHRONISE = "synchronise both machines by chrony or NTP"
 POLL_S = 0.1
-STILL_S = 1.0  # without a change, after which discovery is over
-MIN_WAIT_S = 2.0  # for nodes of other hosts to answer
-ALONE_S = 5.0  # while there is no other node, or one without a name: names come later
-LIMIT_S = 10.0  # of a graph that does not come to rest
-ENDS: tuple[tuple[EndpointKind, EndpointKind], ...] = (
+UNCHANGED_S = 1.0  # discovery is complete after this time without a change,
+MIN_WAIT_S = 2.0  # but not before this time, as nodes of other hosts need time to answer
+INCOMPLETE_WAIT_S = 5.0  # minimum while there is no other node, or one whose name is unknown
+TIMEOUT_S = 10.0  # for a graph that keeps changing
+MATCHING_KINDS: tuple[tuple[EndpointKind, EndpointKind], ...] = (
     ("publisher", "subscriber"),
     ("server", "client"),
 )
-ACTION = "/_action/"  # between an action's name and its parts
-# topics, below a namespace, that several nodes may publish
+ACTION = "/_action/"  # separates an action's name from the names of its topics and services
+# last parts of topic names that several nodes may publish
 SHARED = ("tf", "tf_static", "joint_states", "diagnostics", "rosout", "parameter_events")
 APART = (
     "give each robot its own `namespace:` or `domain:`; or name in `leave_out:` what the other "
     "node offers"
 )
-Owner = tuple[str, EndpointKind]  # a node, and its endpoints of a kind
+Owner = tuple[str, EndpointKind]  # name of a node, and the kind of its endpoints
 
 
 class Trouble(NamedTuple):
-    """The reason why two endpoints exchange nothing, or get in each other's way."""
+    """A problem of two endpoints: they cannot communicate, or they conflict."""
 
     kind: str  # type, qos, hash, name or twice
     topic: str
     text: str
-    do: str
+    do: str  # the remedy
 
 
 async def discovered(
-    endpoints: Callable[[], tuple[GraphEndpoint, ...]], limit_s: float = LIMIT_S
+    endpoints: Callable[[], tuple[GraphEndpoint, ...]], limit_s: float = TIMEOUT_S
 ) -> tuple[GraphEndpoint, ...]:
-    """Return the endpoints of others once nothing new comes, at the latest after `limit_s`."""
+    """Return the endpoints of other nodes once they stop changing, at most after `limit_s`."""
     clock = asyncio.get_running_loop().time
     began_s = changed_s = clock()
     found: frozenset[GraphEndpoint] = frozenset()
     while (now_s := clock()) - began_s < limit_s:
-        newest = frozenset(one for one in endpoints() if not one.ours)
+        newest = frozenset(each for each in endpoints() if not each.ours)
         if newest != found:
             found, changed_s = newest, now_s
-        known = found and all(one.node for one in found)
-        if now_s - changed_s >= STILL_S and now_s - began_s >= (MIN_WAIT_S if known else ALONE_S):
+        complete = found and all(each.node for each in found)
+        min_wait_s = MIN_WAIT_S if complete else INCOMPLETE_WAIT_S
+        if now_s - changed_s >= UNCHANGED_S and now_s - began_s >= min_wait_s:
             break
         await asyncio.sleep(POLL_S)
-    return tuple(sorted(found, key=lambda one: (one.topic, one.type, one.kind, one.node)))
+    return tuple(sorted(found, key=lambda each: (each.topic, each.type, each.kind, each.node)))
 
 
 def unreached(transport: str, domain: int, router: str = "") -> str:
-    """Return what to check where no other node is found."""
+    """Return the advice for the case that no other node is found."""
     if transport == "rmw_zenoh":
         return (
             f"is the router {router} up, do the other nodes run with "
@@ -71,87 +72,91 @@ def unreached(transport: str, domain: int, router: str = "") -> str:
 
 
 def clock_text(offset_s: float) -> str:
-    """Return by how much a clock of others is behind this machine's; negative is ahead."""
-    way = "behind" if offset_s > 0 else "ahead of"
-    return f"{abs(offset_s):.1f} s {way} this machine's clock"
+    """Return the text for a clock that is `offset_s` behind this machine's; negative: ahead."""
+    side = "behind" if offset_s > 0 else "ahead of"
+    return f"{abs(offset_s):.1f} s {side} this machine's clock"
 
 
 def troubles(
     link: Ros2Link, endpoints: Iterable[GraphEndpoint], *, ours_only: bool = False
 ) -> list[Trouble]:
-    """Return what keeps publishers from subscribers and servers from clients, each once.
+    """Return the problems between publishers and subscribers, and servers and clients, each once.
 
-    With `ours_only` one of both ends is of this transport.
+    With `ours_only`, exactly one of the two endpoints belongs to this transport.
     """
     by_topic: dict[str, list[GraphEndpoint]] = defaultdict(list)
     types: dict[str, dict[Owner, set[str]]] = defaultdict(lambda: defaultdict(set))
-    for one in endpoints:
-        by_topic[one.topic].append(one)
-        types[one.topic][one.node, one.kind].add(one.type)
+    for each in endpoints:
+        by_topic[each.topic].append(each)
+        types[each.topic][each.node, each.kind].add(each.type)
     found: dict[Trouble, None] = {}
-    for topic, there in by_topic.items():
-        if ours_only and not any(one.ours for one in there):
-            continue  # such as those of each node, which have many pairs
-        for giver, taker in _pairs(there):
-            if not ours_only or giver.ours != taker.ours:
-                found |= dict.fromkeys(_between(link, giver, taker, types[topic]))
+    for topic, on_topic in by_topic.items():
+        if ours_only and not any(each.ours for each in on_topic):
+            continue  # saves time: topics that each node has, such as /rosout, have many pairs
+        for provider, user in _pairs(on_topic):
+            if not ours_only or provider.ours != user.ours:
+                found |= dict.fromkeys(_between(link, provider, user, types[topic]))
     return list(found)
 
 
-def _pairs(there: list[GraphEndpoint]) -> Iterator[tuple[GraphEndpoint, GraphEndpoint]]:
-    for giving, taking in ENDS:
-        for giver in (one for one in there if one.kind == giving):
-            yield from ((giver, one) for one in there if one.kind == taking)
+def _pairs(endpoints: list[GraphEndpoint]) -> Iterator[tuple[GraphEndpoint, GraphEndpoint]]:
+    """Yield (publisher, subscriber) and (server, client) of one topic or service."""
+    for provider_kind, user_kind in MATCHING_KINDS:
+        for provider in (each for each in endpoints if each.kind == provider_kind):
+            yield from ((provider, each) for each in endpoints if each.kind == user_kind)
 
 
 def _between(
-    link: Ros2Link, giver: GraphEndpoint, taker: GraphEndpoint, types: dict[Owner, set[str]]
+    link: Ros2Link, provider: GraphEndpoint, user: GraphEndpoint, types: dict[Owner, set[str]]
 ) -> Iterator[Trouble]:
-    topic, one, other = giver.topic, _name(giver), _name(taker)
-    if giver.type != taker.type:
-        if types[giver.node, giver.kind].isdisjoint(types[taker.node, taker.kind]):
-            text = f"{one} has the type {giver.type}, {other} {taker.type}"
+    topic, provider_name, user_name = provider.topic, _name(provider), _name(user)
+    if provider.type != user.type:
+        if types[provider.node, provider.kind].isdisjoint(types[user.node, user.kind]):
+            text = f"{provider_name} has the type {provider.type}, {user_name} {user.type}"
             yield Trouble("type", topic, text, "use one type at both ends")
         return
-    wrong = mismatch(giver.qos, taker.qos) if link.transport == "dds" else ""
+    wrong = mismatch(provider.qos, user.qos) if link.transport == "dds" else ""
     if wrong:
-        text = f"nothing passes from {one} to {other}: {wrong}"
-        do = f"have {one} publish" if taker.ours else f"have {other} subscribe"
-        yield Trouble("qos", topic, text, f"{do} with {taker.qos if taker.ours else giver.qos}")
-    yield from _definitions(link, giver, taker)
+        text = f"nothing passes from {provider_name} to {user_name}: {wrong}"
+        do = f"have {provider_name} publish" if user.ours else f"have {user_name} subscribe"
+        yield Trouble("qos", topic, text, f"{do} with {user.qos if user.ours else provider.qos}")
+    yield from _definitions(link, provider, user)
 
 
-def _definitions(link: Ros2Link, giver: GraphEndpoint, taker: GraphEndpoint) -> Iterator[Trouble]:
-    one, other = _name(giver), _name(taker)
-    if giver.hash and taker.hash and giver.hash != taker.hash:
-        text = f"{one} and {other} have different definitions of {giver.type}"
+def _definitions(link: Ros2Link, provider: GraphEndpoint, user: GraphEndpoint) -> Iterator[Trouble]:
+    provider_name, user_name = _name(provider), _name(user)
+    if provider.hash and user.hash and provider.hash != user.hash:
+        text = f"{provider_name} and {user_name} have different definitions of {provider.type}"
         do = "use the same version of its package, or give ours by `types:`"
-        yield Trouble("hash", giver.topic, text, do)
-    elif giver.hash != taker.hash and link.transport == "rmw_zenoh":
-        humble = other if giver.hash else one
+        yield Trouble("hash", provider.topic, text, do)
+    elif provider.hash != user.hash and link.transport == "rmw_zenoh":
+        humble = user_name if provider.hash else provider_name
         text = (
-            f"nothing passes between {one} and {other}: {humble} has no type hashes, as on Humble"
+            f"nothing passes between {provider_name} and {user_name}: "
+            f"{humble} has no type hashes, as on Humble"
         )
         do = "set distro: humble" if link.distro != "humble" else "set distro: jazzy"
-        yield Trouble("hash", giver.topic, text, f"{do}, or use the same distribution everywhere")
+        yield Trouble(
+            "hash", provider.topic, text, f"{do}, or use the same distribution everywhere"
+        )
 
 
-def _name(one: GraphEndpoint) -> str:
-    return one.node or "a node without a name"
+def _name(endpoint: GraphEndpoint) -> str:
+    return endpoint.node or "a node without a name"
 
 
 def doubles(endpoints: Iterable[GraphEndpoint]) -> list[Trouble]:
-    """Return the nodes that offer what ours offers, such as a second robot's, each once."""
-    endpoints = [one for one in endpoints if one.kind in ("publisher", "server")]
-    ours = [one for one in endpoints if one.ours and one.topic.rpartition("/")[2] not in SHARED]
-    names, nodes = {(one.kind, one.topic) for one in ours}, {one.node for one in ours}
-    same: dict[str, set[str]] = defaultdict(set)
-    for one in endpoints:
-        if not one.ours and (one.kind, one.topic) in names:
-            node = f"another {one.node}" if one.node in nodes else _name(one)
-            same[node].add(one.topic.partition(ACTION)[0])
+    """Return the other nodes that offer one of our topics or services, such as a second robot's."""
+    endpoints = [each for each in endpoints if each.kind in ("publisher", "server")]
+    ours = [each for each in endpoints if each.ours and each.topic.rpartition("/")[2] not in SHARED]
+    names, nodes = {(each.kind, each.topic) for each in ours}, {each.node for each in ours}
+    doubled: dict[str, set[str]] = defaultdict(set)
+    for each in endpoints:
+        if not each.ours and (each.kind, each.topic) in names:
+            node = f"another {each.node}" if each.node in nodes else _name(each)
+            doubled[node].add(each.topic.partition(ACTION)[0])
     found = []
-    for node, topics in same.items():
+    for node, topics in doubled.items():
         first, *more = sorted(topics)
         text = f"{node} offers it as well" + (f", and {len(more)} more" if more else "")
         found.append(Trouble("twice", first, text, APART))
@@ -159,9 +164,9 @@ def doubles(endpoints: Iterable[GraphEndpoint]) -> list[Trouble]:
 
 
 def nameless(link: Ros2Link, endpoints: Iterable[GraphEndpoint]) -> Trouble | None:
-    """Return what the nodes without names may be: over DDS, Humble tells them in another form."""
-    odd = {one.topic for one in endpoints if not (one.ours or one.node or one.hash)}
-    if not odd or link.transport != "dds" or link.distro == "humble":
+    """Return the trouble of nodes without names: over DDS, Humble announces them differently."""
+    topics = {each.topic for each in endpoints if not (each.ours or each.node or each.hash)}
+    if not topics or link.transport != "dds" or link.distro == "humble":
         return None
-    text = f"nodes with neither name nor type hashes, as on {min(odd)}"
-    return Trouble("name", min(odd), text, "if they run Humble, set distro: humble")
+    text = f"nodes with neither name nor type hashes, as on {min(topics)}"
+    return Trouble("name", min(topics), text, "if they run Humble, set distro: humble")

@@ -1,7 +1,6 @@
 """Reads .msg, .srv and .action files into field definitions of rosbags.
 
-The services and topics of an action, and the messages of a service, are derived as
-`rosidl` derives them.
+The messages of a service, and the services and topics of an action, are derived as in `rosidl`.
 """
 
 from collections.abc import Iterable, Iterator
@@ -14,7 +13,7 @@ from rosbags.typesys.msg import MSGParser
 
 from gigabrain_zenoh.errors import ConfigError
 
-Description = tuple[Any, Any]  # rosbags' description of a type: a Nodetype, and what belongs to it
+Description = tuple[Any, Any]  # rosbags' description of a type: (Nodetype, its parameters)
 Fields = list[tuple[str, Description]]
 SHIPPED = Path(__file__).parent / "definitions"
 KINDS = ("msg", "srv", "action")
@@ -26,7 +25,7 @@ PARTS = {
 UUID = "unique_identifier_msgs/msg/UUID"
 TIME = "builtin_interfaces/msg/Time"
 EVENT_INFO = "service_msgs/msg/ServiceEventInfo"
-DUMMY = "structure_needs_at_least_one_member"  # field of a message without any, on the wire as well
+DUMMY = "structure_needs_at_least_one_member"  # field of an empty message, also on the wire
 
 
 class Definition(NamedTuple):
@@ -34,29 +33,29 @@ class Definition(NamedTuple):
 
     constants: list[tuple[str, str, Any]]  # name, type, value
     fields: Fields
-    defaults: dict[str, Any]  # of those fields that have one, unchecked like the constants
+    defaults: dict[str, Any]  # by field, if it has one; unchecked, as the constants are
     file: Path
 
 
 class Found(NamedTuple):
-    """The types of some files."""
+    """All types in a number of files."""
 
     messages: dict[str, Definition]
-    interfaces: dict[str, Fields]  # services and actions, by the fields that `rosidl` hashes
+    interfaces: dict[str, Fields]  # services and actions, with the fields that `rosidl` hashes
 
 
 def base(name: str) -> Description:
-    """Describe a field of a primitive type."""
+    """Return the description of a field of a primitive type."""
     return (Nodetype.BASE, (name, 0))
 
 
 def named(name: str) -> Description:
-    """Describe a field of a message type."""
+    """Return the description of a field of a message type."""
     return (Nodetype.NAME, name)
 
 
 def read_files(paths: Iterable[Path]) -> Found:
-    """Read files, and all in the folders among `paths`. Raises ConfigError."""
+    """Read files, and all files in folders. Raises ConfigError."""
     found = Found({}, {})
     for path in paths:
         for file in _files(path):
@@ -79,14 +78,14 @@ def _files(path: Path) -> Iterator[Path]:
 
 
 def _name_of(file: Path) -> str:
-    """Return `my_msgs/msg/Thing` of my_msgs/msg/Thing.msg, or of my_msgs/Thing.msg."""
+    """Return the type's name: `my_msgs/msg/A` for my_msgs/msg/A.msg or my_msgs/A.msg."""
     kind, folder = file.suffix[1:], file.resolve().parent
     package = folder.parent.name if folder.name == kind else folder.name
     return f"{package}/{kind}/{file.stem}"
 
 
 def _parts(file: Path) -> Iterator[tuple[str, str]]:
-    """Yield name and text of the messages that a file holds."""
+    """Yield (name, text) of each message in a file."""
     kind = file.suffix[1:]
     try:
         text = file.read_text(encoding="utf-8-sig")
@@ -107,12 +106,12 @@ def _parts(file: Path) -> Iterator[tuple[str, str]]:
 
 def _parse(name: str, text: str, file: Path) -> Definition:
     package, _, short = name.split("/")
-    try:  # as a message: a bare type's name means a message of the same package
+    try:  # parsed as a message, so that a bare type name means a message of this package
         (message,) = MSGParser(f"MSG: {package}/msg/{short}\n{text}").specification()
     except TypesysError as error:
         line = str(error).splitlines()[-1] if str(error).splitlines() else ""
         raise ConfigError(f"{file}: no ROS message definition, near {line[:60]!r}") from None
-    except (AssertionError, ValueError) as error:  # of rosbags' parser, and of int()
+    except (AssertionError, ValueError) as error:  # from rosbags' parser and int()
         raise ConfigError(f"{file}: {str(error) or 'a constant is a list'}") from None
     if wrong := [each.name for each in message.fields if min(each.typ.size, each.typ.str_size) < 0]:
         raise ConfigError(f"{file}: {wrong[0]}: expected a size of 0 or more")
@@ -126,7 +125,7 @@ def _parse(name: str, text: str, file: Path) -> Definition:
 
 
 def _derive(file: Path, found: Found) -> None:
-    """Add what `rosidl` generates beside the messages of a service or an action."""
+    """Add the types that `rosidl` derives from a service or an action."""
     name, kind = _name_of(file), file.suffix[1:]
     if kind == "srv":
         _derive_service(name, file, found)

@@ -1,6 +1,6 @@
-"""RIHS01, the hash by which ROS 2 names the definition of a type (REP-2016).
+"""RIHS01, the hash of a type's definition in ROS 2 (REP-2016).
 
-rosbags hashes types with `char` wrongly: `rosidl` turns `char` into `uint8` first.
+The hashes of rosbags are wrong for `char`, which `rosidl` converts to `uint8` first.
 """
 
 import json
@@ -13,8 +13,8 @@ from rosbags.interfaces import Nodetype
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.ros2.type_files import Description, Fields
 
-# numbers of type_description_interfaces/msg/FieldType
-NUMBERS = {
+# constants of type_description_interfaces/msg/FieldType
+TYPE_IDS = {
     "int8": 2,
     "uint8": 3,
     "int16": 4,
@@ -31,13 +31,13 @@ NUMBERS = {
     "string": 17,
 }
 NESTED, BOUNDED_STRING = 1, 21
-ARRAY, BOUNDED_SEQUENCE, SEQUENCE = 48, 96, 144  # added to the number of the element's type
+ARRAY, BOUNDED_SEQUENCE, SEQUENCE = 48, 96, 144  # added to the id of the element's type
 
 
 def rihs01(name: str, fields_of: Callable[[str], Fields]) -> str:
     """Return the hash of a message, service or action.
 
-    Raises what `fields_of` raises, and ConfigError for a message that contains itself.
+    Raises the errors of `fields_of`, and ConfigError for a message that contains itself.
     """
     described: dict[str, Any] = {}
     waiting = [name]
@@ -51,33 +51,33 @@ def rihs01(name: str, fields_of: Callable[[str], Fields]) -> str:
         if name in nested:
             raise ConfigError(f"{name} contains itself, which ROS does not allow")
         waiting.extend(nested)
-    whole = {
+    description = {
         "type_description": described[name],
         "referenced_type_descriptions": [described[k] for k in sorted(described) if k != name],
     }
-    return f"RIHS01_{sha256(json.dumps(whole).encode()).hexdigest()}"
+    return f"RIHS01_{sha256(json.dumps(description).encode()).hexdigest()}"
 
 
 def _field(name: str, description: Description) -> dict[str, Any]:
-    kind, inner, added, capacity = description[0], description, 0, 0
+    kind, inner, offset, capacity = description[0], description, 0, 0
     if kind == Nodetype.ARRAY:
         inner, capacity = description[1]
-        added = ARRAY
+        offset = ARRAY
     elif kind == Nodetype.SEQUENCE:
         inner, capacity = description[1]
-        added = BOUNDED_SEQUENCE if capacity else SEQUENCE
-    number, longest, nested = NESTED, 0, ""
+        offset = BOUNDED_SEQUENCE if capacity else SEQUENCE
+    type_id, max_length, nested = NESTED, 0, ""
     if inner[0] == Nodetype.NAME:
         nested = inner[1]
     else:
-        primitive, longest = inner[1]
-        number = BOUNDED_STRING if longest else NUMBERS[primitive]
+        primitive, max_length = inner[1]
+        type_id = BOUNDED_STRING if max_length else TYPE_IDS[primitive]
     return {
         "name": name,
         "type": {
-            "type_id": added + number,
+            "type_id": offset + type_id,
             "capacity": capacity,
-            "string_capacity": longest,
+            "string_capacity": max_length,
             "nested_type_name": nested,
         },
     }

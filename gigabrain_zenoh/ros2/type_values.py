@@ -1,4 +1,4 @@
-"""Values of ROS messages: defaults, what JSON holds for them, and what Python makes of that."""
+"""Makes ROS messages from Python values or JSON, with defaults, and converts them to JSON."""
 
 import base64
 import binascii
@@ -18,34 +18,34 @@ from gigabrain_zenoh.ros2.type_files import DUMMY, Description
 
 BYTES = ("uint8", "char", "byte")
 DTYPES = {"bool": np.dtype(np.bool_), "char": np.dtype(np.uint8), "byte": np.dtype(np.int8)}
-Make = Callable[[], Any]
-Fit = Callable[[Any], Any]  # a value as rosbags encodes it
-Plan = dict[str, tuple[Description, Make, Fit]]  # by the attribute's name, in the wire's order
+MakeDefault = Callable[[], Any]
+Convert = Callable[[Any], Any]  # returns a value that rosbags can encode
+Plan = dict[str, tuple[Description, MakeDefault, Convert]]  # by attribute, in the wire's order
 
 
 def dtype(primitive: str) -> np.dtype[Any]:
-    """Return the type of the elements of an array."""
+    """Return numpy's type of a primitive type."""
     return DTYPES.get(primitive) or np.dtype(primitive)
 
 
 def is_text(kind: Description) -> bool:
-    """Return whether a field is a text."""
+    """Return whether a field is a string."""
     return bool(kind[0] == Nodetype.BASE and kind[1][0] == "string")
 
 
 class Values:
-    """Makes and reads the messages of a store of types."""
+    """Makes and converts messages of the types in a store."""
 
     def __init__(self, store: Typestore, defaults: Mapping[str, Mapping[str, Any]]) -> None:
         self._store, self._defaults = store, defaults
         self._plans: dict[str, Plan] = {}
 
     def make(self, name: str, fields: Mapping[str, Any]) -> Any:
-        """Make a message of `fields`, and of defaults."""
+        """Make a message from `fields`; others get their defaults. Raises ConfigError."""
         plan = self._plan(name)
         values = [
-            fit(fields[field]) if field in fields else default()
-            for field, (_, default, fit) in plan.items()
+            convert(fields[field]) if field in fields else default()
+            for field, (_, default, convert) in plan.items()
         ]
         if not fields.keys() <= plan.keys():
             wrong = ", ".join(sorted(fields.keys() - plan.keys()))
@@ -53,7 +53,7 @@ class Values:
         return self._store.types[name](*values)
 
     def from_dict(self, name: str, data: Any, path: str = "") -> Any:
-        """Make a message of JSON's values. Raises BadPayload."""
+        """Make a message from JSON values. Raises BadPayload."""
         plan = self._plan(name)
         if not isinstance(data, Mapping):
             raise BadPayload(f"{path or name}: expected an object, got {_short(data)}")
@@ -69,7 +69,7 @@ class Values:
         return self._store.types[name](*values)
 
     def to_dict(self, message: Any) -> dict[str, Any]:
-        """Return the message's fields in JSON's values."""
+        """Return the message as JSON values."""
         return {
             field: self._plain(kind, getattr(message, field))
             for field, (kind, *_) in self._plan(message.__msgtype__).items()
@@ -77,7 +77,7 @@ class Values:
         }
 
     def known_part(self, name: str, data: Mapping[str, Any]) -> dict[str, Any]:
-        """Return those of JSON's values that a type has fields for."""
+        """Return the JSON values without fields that the type does not have."""
         return {
             field: self._known(kind, data[field])
             for field, (kind, *_) in self._plan(name).items()
@@ -85,12 +85,12 @@ class Values:
         }
 
     def default(self, kind: Description, given: Any, path: str) -> Any:
-        """Return a field's default as its definition gives it. Raises BadPayload."""
+        """Check and return the default of a field in its definition. Raises BadPayload."""
         if kind[0] == Nodetype.BASE:
             return literal(kind[1], given, path)
         if kind[0] == Nodetype.NAME or kind[1][0][0] == Nodetype.NAME:
             raise BadPayload(f"{path}: a message has no default, got {_short(given)}")
-        values = [] if given == "[]" else given  # which rosbags takes for a text
+        values = [] if given == "[]" else given  # rosbags parses it as a string
         if not isinstance(values, list):
             raise BadPayload(f"{path}: expected a list, got {_short(given)}")
         values = [literal(kind[1][0][1], each, path) for each in values]
@@ -110,14 +110,14 @@ class Values:
             given = self._defaults.get(name, {})
             plan = self._plans[name] = {}
             for field, kind in self._store.fielddefs[name][1]:
-                key, fit = normalize_fieldname(field), self._fit(kind)
+                key, convert = normalize_fieldname(field), self._converter(kind)
                 default = self._default(kind)
                 if key in given:
-                    default = functools.partial(fit, given[key])
-                plan[key] = (kind, default, fit)
+                    default = functools.partial(convert, given[key])
+                plan[key] = (kind, default, convert)
         return plan
 
-    def _default(self, kind: Description) -> Make:
+    def _default(self, kind: Description) -> MakeDefault:
         if kind[0] == Nodetype.NAME:
             return lambda: self.make(kind[1], {})
         if kind[0] == Nodetype.BASE:
@@ -130,11 +130,11 @@ class Values:
         if inner[0] == Nodetype.BASE and inner[1][0] != "string":
             element = dtype(inner[1][0])
             return lambda: np.zeros(count, element)
-        one = self._default(inner)
-        return lambda: [one() for _ in range(count)]
+        element_default = self._default(inner)
+        return lambda: [element_default() for _ in range(count)]
 
-    def _fit(self, kind: Description) -> Fit:
-        """Return what turns a field's mappings and lists; other values are taken as they are."""
+    def _converter(self, kind: Description) -> Convert:
+        """Return the conversion of a field's mappings and lists; it keeps other values."""
         if kind[0] == Nodetype.BASE:
             return lambda value: value
         if kind[0] == Nodetype.NAME:
@@ -142,8 +142,8 @@ class Values:
             return lambda value: value if type(value) is message else self._nested(kind[1], value)
         inner = kind[1][0]
         if inner[0] == Nodetype.NAME:
-            one = self._fit(inner)
-            return lambda value: [one(each) for each in value]
+            convert = self._converter(inner)
+            return lambda value: [convert(each) for each in value]
         if inner[1][0] == "string":
             return list
         return functools.partial(_array, dtype(inner[1][0]))
@@ -177,7 +177,7 @@ class Values:
         if kind[0] == Nodetype.NAME:
             return self.to_dict(value)
         if kind[0] == Nodetype.BASE:
-            return _text(value) if isinstance(value, float) else value
+            return _json_number(value) if isinstance(value, float) else value
         inner = kind[1][0]
         if inner[0] == Nodetype.NAME:
             return [self.to_dict(each) for each in value]
@@ -186,7 +186,7 @@ class Values:
         if kind[0] == Nodetype.SEQUENCE and inner[1][0] in BYTES:
             return base64.b64encode(value.tobytes()).decode()
         elements = value.tolist()
-        return [_text(each) for each in elements] if value.dtype.kind == "f" else elements
+        return [_json_number(each) for each in elements] if value.dtype.kind == "f" else elements
 
 
 def _array(element: np.dtype[Any], value: Any) -> Any:
@@ -195,8 +195,8 @@ def _array(element: np.dtype[Any], value: Any) -> Any:
     return np.ascontiguousarray(value, element).reshape(-1)
 
 
-def _text(number: float) -> float | str:
-    """Return a number that JSON knows, or the name that others have for it."""
+def _json_number(number: float) -> float | str:
+    """Return a finite number as it is, and others as text, because JSON has none for them."""
     if math.isfinite(number):
         return number
     if math.isnan(number):
@@ -204,28 +204,28 @@ def _text(number: float) -> float | str:
     return "Infinity" if number > 0 else "-Infinity"
 
 
-NAMES = {"NaN": math.nan, "Infinity": math.inf, "-Infinity": -math.inf}
+NON_FINITE = {"NaN": math.nan, "Infinity": math.inf, "-Infinity": -math.inf}
 
 
 def literal(kind: tuple[str, int], given: Any, path: str) -> Any:
-    """Return a constant or default of a primitive type as rosidl reads it. Raises BadPayload."""
-    primitive, longest = kind
-    if primitive == "byte":  # of 0 to 255 there; on the wire it is the same
+    """Return a constant or default of a primitive type, as in rosidl. Raises BadPayload."""
+    primitive, max_length = kind
+    if primitive == "byte":  # 0 to 255 in a definition; -128 to 127 in rosbags
         return int(np.uint8(_scalar("uint8", 0, given, path)).astype(np.int8))
     if primitive == "bool" and given in (0, 1):
         given = bool(given)
     if primitive.startswith("float") and isinstance(given, str):
         with contextlib.suppress(ValueError):  # such as nan
             given = float(given)
-    return _scalar(primitive, longest, given, path)
+    return _scalar(primitive, max_length, given, path)
 
 
-def _scalar(primitive: str, longest: int, value: Any, path: str) -> Any:
-    """Return a number, truth value or text of the type. Raises BadPayload."""
+def _scalar(primitive: str, max_length: int, value: Any, path: str) -> Any:
+    """Check and return a number, bool or string of a primitive type. Raises BadPayload."""
     if primitive == "string":
         if isinstance(value, str) and "\0" not in value:
-            if longest and len(value.encode(errors="replace")) > longest:
-                raise BadPayload(f"{path}: expected at most {longest} bytes")
+            if max_length and len(value.encode(errors="replace")) > max_length:
+                raise BadPayload(f"{path}: expected at most {max_length} bytes")
             return value.encode(errors="replace").decode()
         raise BadPayload(f"{path}: expected a text, got {_short(value)}")
     if primitive == "bool":
@@ -243,8 +243,8 @@ def _scalar(primitive: str, longest: int, value: Any, path: str) -> Any:
 
 
 def _float(primitive: str, value: Any, path: str) -> float:
-    if isinstance(value, str) and value in NAMES:
-        return NAMES[value]
+    if isinstance(value, str) and value in NON_FINITE:
+        return NON_FINITE[value]
     largest = float(np.finfo(dtype(primitive)).max)
     if isinstance(value, int | float) and not isinstance(value, bool):
         if isinstance(value, float) and not math.isfinite(value):

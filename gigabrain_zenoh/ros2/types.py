@@ -1,7 +1,7 @@
-"""Types of ROS 2 messages: their CDR, their hashes, and values made from Python's own.
+"""ROS 2 message types: encodes and decodes CDR, hashes types, and makes messages.
 
-Messages are instances of the dataclasses that rosbags generates; arrays of numbers are numpy
-arrays. Definitions are those of Jazzy that rosbags brings, those in `definitions/`, and the user's.
+Messages are instances of dataclasses that rosbags generates; arrays of numbers are numpy arrays.
+Definitions come from rosbags (Jazzy), `definitions/`, and the user's files.
 """
 
 import difflib
@@ -19,20 +19,20 @@ from gigabrain_zenoh.ros2.type_files import SHIPPED, Definition, Fields, Found, 
 from gigabrain_zenoh.ros2.type_hash import rihs01
 from gigabrain_zenoh.ros2.type_values import Values, is_text, literal
 
-DEFAULTS: dict[str, dict[str, Any]] = {  # of types in rosbags' store, which keeps none
+DEFAULTS: dict[str, dict[str, Any]] = {  # for types of rosbags, which has no default values
     "geometry_msgs/msg/Quaternion": {"w": 1.0},
     "sensor_msgs/msg/NavSatStatus": {"status": -2},
 }
 MAX_PAYLOAD = 64 << 20  # bytes of one message
-MAX_COMMAND = 64 << 10  # bytes of one that ROS commands or asks by; a goal takes 150
-LARGE = 1 << 16  # bytes
+MAX_COMMAND = 64 << 10  # bytes of one command or request; a goal has 150
+MIN_VIEW_BYTES = 1 << 16  # a copy of a shorter payload is cheaper than a view
 
 
 class Types:
     """All message, service and action types that this process knows."""
 
     def __init__(self, more: Iterable[Path] = ()) -> None:
-        """Load the definitions; `more` are files or folders of the user's. Raises ConfigError."""
+        """Load all definitions; `more` are the user's files or folders. Raises ConfigError."""
         self._store: Any = get_typestore(Stores.ROS2_JAZZY)
         self._interfaces: dict[str, Fields] = {}  # services and actions
         self._hashes: dict[str, str] = {}
@@ -42,7 +42,7 @@ class Types:
             self._add(found)
 
     def known(self, name: str) -> str:
-        """Return the name of a message type. Raises ConfigError if it is unknown."""
+        """Return `name`. Raises UnknownName, a ConfigError, if there is no such message type."""
         if name not in self._store.fielddefs:
             close = difflib.get_close_matches(name, self._store.fielddefs, n=1)
             hint = f"did you mean {close[0]!r}?" if close else "add its definition by `types:`"
@@ -54,52 +54,52 @@ class Types:
         return tuple(sorted(self._store.fielddefs))
 
     def encode(self, name: str, message: object) -> bytes:
-        """Return the message as CDR, little-endian, with its header of 4 bytes."""
+        """Return the message as little-endian CDR, with its 4-byte header."""
         return bytes(self._store.serialize_cdr(message, self.known(name), little_endian=True))
 
     def decode(self, name: str, payload: bytes) -> Any:
-        """Return the message in a payload; ignores a tail and the content of padding.
+        """Return the message in a payload; ignores padding, and bytes after the message.
 
-        Arrays of numbers are views of the payload. Raises BadPayload, and nothing else.
+        Arrays of numbers are views of the payload. Raises only BadPayload, for any payload.
         """
         return decoded(self._store, self.known(name), payload)
 
     def decode_command(self, name: str, payload: bytes, max_bytes: int = MAX_COMMAND) -> Any:
-        """Return a command or request; to decode a large one would hold up the others.
+        """Decode a command or request of limited size, because a large one would block others.
 
-        Raises BadPayload, and nothing else.
+        Raises only BadPayload, for any payload.
         """
         if len(payload) > max_bytes:
             raise BadPayload(f"{name}: {len(payload)} bytes; expected at most {max_bytes}")
         return self.decode(name, payload)
 
     def make(self, name: str, /, **fields: Any) -> Any:
-        """Make a message; fields that are left out get their defaults, in nested ones as well.
+        """Make a message. Omitted fields get their defaults, also in nested messages.
 
-        Values are taken as they are, but for lists of numbers, and mappings in place of messages.
+        Lists of numbers, and mappings in place of messages, are converted; other values are not.
         Raises ConfigError for an unknown type or field.
         """
         return self._values.make(self.known(name), fields)
 
     def from_dict(self, name: str, data: Mapping[str, Any]) -> Any:
-        """Make a message from JSON's values, checked. Raises BadPayload with the field."""
+        """Check JSON values, and make a message. Raises BadPayload, which names the field."""
         return self._values.from_dict(self.known(name), data)
 
     def to_dict(self, message: object) -> dict[str, Any]:
-        """Return the message in JSON's values: bytes as base64, and NaN and Infinity as texts."""
+        """Return the message as JSON values: bytes as base64, NaN and Infinity as strings."""
         return self._values.to_dict(message)
 
     def known_part(self, name: str, data: Mapping[str, Any]) -> dict[str, Any]:
-        """Return the part of JSON's values that a type has fields for, in nested ones as well."""
+        """Return the JSON values without unknown fields, also in nested messages."""
         return self._values.known_part(self.known(name), data)
 
     def only_text(self, name: str) -> str:
-        """Return the name of a type's field if it has but one, a text; else an empty text."""
+        """Return the name of a type's only field if that is a string; otherwise an empty string."""
         field, kind = self.fields(name)[0]
         return field if len(self.fields(name)) == 1 and is_text(kind) else ""
 
     def definition(self, name: str) -> str:
-        """Return a message's definition with all that it holds, as bags and viewers want it."""
+        """Return a message's definition with all nested ones, in the format of bags and viewers."""
         text: str = self._store.generate_msgdef(self.known(name), ros_version=2)[0]
         return text
 
@@ -110,7 +110,7 @@ class Types:
         return self._hashes[name]
 
     def fields(self, name: str) -> Fields:
-        """Return the fields of a message type, as rosbags describes them. Raises ConfigError."""
+        """Return rosbags' description of the fields of a message type. Raises ConfigError."""
         fields: Fields = self._store.fielddefs[self.known(name)][1]
         return fields
 
@@ -135,25 +135,25 @@ class Types:
             except ConfigError as error:
                 raise ConfigError(f"{each.file}: a field of {name}: {error}") from None
 
-    def _checked_defaults(self, of: Definition) -> dict[str, Any]:
-        """Return the defaults of fields by their attributes; check the constants as well."""
-        kinds = dict(of.fields)
+    def _checked_defaults(self, definition: Definition) -> dict[str, Any]:
+        """Return a definition's defaults by attribute; check its constants as well."""
+        kinds = dict(definition.fields)
         try:
-            for name, primitive, value in of.constants:
-                if primitive != "string":  # which may be without quotes, and then seem a number
+            for name, primitive, value in definition.constants:
+                if primitive != "string":  # an unquoted string may look like a number
                     literal((primitive, 0), value, f"constant {name}")
             return {
                 normalize_fieldname(field): self._values.default(
                     kinds[field], value, f"default of {field}"
                 )
-                for field, value in of.defaults.items()
+                for field, value in definition.defaults.items()
             }
         except BadPayload as error:
-            raise ConfigError(f"{of.file}: {error}") from None
+            raise ConfigError(f"{definition.file}: {error}") from None
 
 
 def decoded(store: Any, name: str, payload: bytes) -> Any:
-    """Return the message in a payload, of a type in a store of rosbags. Raises BadPayload."""
+    """Return the message in a payload, by a type store of rosbags. Raises only BadPayload."""
     if not 4 <= len(payload) <= MAX_PAYLOAD or payload[0] or payload[1] > 1:
         raise BadPayload(f"{name}: no CDR: {len(payload)} bytes, {payload[:4].hex()}…")
     definition = store.get_msgdef(name)
@@ -165,5 +165,5 @@ def decoded(store: Any, name: str, payload: bytes) -> Any:
 
 
 def _body(payload: bytes) -> bytes | memoryview:
-    """Return what follows the header, without a copy where a copy would cost more."""
-    return payload[4:] if len(payload) < LARGE else memoryview(payload)[4:]
+    """Return the payload without its header: a copy, or a view if that is cheaper."""
+    return payload[4:] if len(payload) < MIN_VIEW_BYTES else memoryview(payload)[4:]

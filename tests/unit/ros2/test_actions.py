@@ -9,11 +9,11 @@ import pytest
 from gigabrain_zenoh.config.settings import Ros2Link
 from gigabrain_zenoh.errors import NoAnswer, Refused
 from gigabrain_zenoh.ros2.actions import (
-    CANCEL,
-    KEPT_S,
+    CANCEL_TYPE,
     MAX_ACTIVE,
-    STATUS_S,
-    STATUSES,
+    RESULT_LIFETIME_S,
+    STATUS_INTERVAL_S,
+    STATUS_TYPE,
     ActionServer,
     CancelCode,
     Goal,
@@ -74,7 +74,7 @@ class Client:
 
     async def cancel(self, id: bytes = bytes(16), sec: int = 0) -> tuple[int, list[bytes]]:
         info = {"goal_id": {"uuid": id}, "stamp": {"sec": sec}}
-        answer = await self.ask("cancel_goal", CANCEL, goal_info=info)
+        answer = await self.ask("cancel_goal", CANCEL_TYPE, goal_info=info)
         ids = [each.goal_id.uuid.tobytes() for each in answer.goals_canceling]
         return answer.return_code, ids
 
@@ -101,10 +101,13 @@ class World:
         got: list[list[int]] = []
         self.client.node.subscribe(
             "/navigate_to_pose/_action/status",
-            STATUSES,
+            STATUS_TYPE,
             ACTION_STATUS,
             lambda received: got.append(
-                [each.status for each in self.types.decode(STATUSES, received.payload).status_list]
+                [
+                    each.status
+                    for each in self.types.decode(STATUS_TYPE, received.payload).status_list
+                ]
             ),
         )()
         return got[-1]
@@ -213,15 +216,15 @@ async def test_the_states_of_many_goals_are_reported_a_few_times(world: World) -
     loop = asyncio.get_running_loop()
     world.client.node.subscribe(
         "/navigate_to_pose/_action/status",
-        STATUSES,
+        STATUS_TYPE,
         ACTION_STATUS,
-        lambda got: told.append(len(world.types.decode(STATUSES, got.payload).status_list)),
+        lambda got: told.append(len(world.types.decode(STATUS_TYPE, got.payload).status_list)),
     )
     began_s = loop.time()
     for number in range(30):
         await world.client.send(number.to_bytes(16, "big"))
     await until(lambda: told[-1] == 30, "all goals on the status topic")
-    assert len(told) <= 3 + (loop.time() - began_s) / STATUS_S
+    assert len(told) <= 3 + (loop.time() - began_s) / STATUS_INTERVAL_S
 
 
 async def test_a_large_request_is_not_decoded(world: World) -> None:
@@ -267,9 +270,9 @@ def test_results_are_kept_for_a_time_and_bounded() -> None:
     goals = Goals()
     first = goals.accept(A, None, 0)
     goals.end(first, Outcome(S.SUCCEEDED), 0)
-    goals.forget(int(KEPT_S * 1e9))
+    goals.forget(int(RESULT_LIFETIME_S * 1e9))
     assert goals.get(A) is first
-    goals.forget(int(KEPT_S * 1e9) + 1)
+    goals.forget(int(RESULT_LIFETIME_S * 1e9) + 1)
     assert goals.get(A) is None
 
 
