@@ -1,1 +1,1 @@
-"""A ROS 2 robot as a body: its topics, its odometry, and the guard that stops it."""
+"""Drives a ROS 2 robot: its topics, its odometry, and the guard that stops it."""

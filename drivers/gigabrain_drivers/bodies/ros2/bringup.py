@@ -1,4 +1,4 @@
-"""Compares a ROS 2 robot with its file: missing topics, and remedies. Pure.
+"""Compares a ROS 2 robot with its file: finds missing topics and other faults. Pure.
 
 `explain` needs only the graph, for a driver's log; `findings` also needs messages.
 """
@@ -18,10 +18,10 @@ from gigabrain_zenoh.ros2.graph import CLOCK_S, SYNCHRONISE, clock_text, unreach
 from gigabrain_zenoh.ros2.qos import Qos, mismatch
 from gigabrain_zenoh.ros2.transport import GraphEndpoint, absolute
 
-MIN_RATE_SHARE = 0.8  # of the rate in the robot's file
-MAX_ERROR_M, MAX_ERROR_RAD = 0.02, 0.05  # of a mounting in the file, against /tf_static
+MIN_RATE_SHARE = 0.8  # minimum rate, as a share of the rate in the robot's file
+MAX_ERROR_M, MAX_ERROR_RAD = 0.02, 0.05  # between a mounting in the file and in /tf_static
 SIM_TIME_S = 1e8  # smaller stamps are simulated time, not Unix time
-MAX_NAMED = 4
+MAX_NAMED = 4  # topics in one text
 NO_TILT = (
     "it has no orientation (orientation_covariance[0] is -1), so tilt_stop cannot stop the robot"
 )
@@ -35,7 +35,7 @@ Verdict = Literal["ok", "warning", "error"]
 class Finding(NamedTuple):
     """One line of the check."""
 
-    what: str  # the topic, or the frames
+    what: str  # a topic or frame
     verdict: Verdict
     text: str  # the result
     do: str = ""  # the remedy
@@ -44,11 +44,11 @@ class Finding(NamedTuple):
 class Row(NamedTuple):
     """A topic that the robot's file names."""
 
-    part: str
-    topic: str  # with its namespace
+    part: str  # its name in `topics:`
+    topic: str  # absolute name
     type: str
     qos: Qos
-    hz: float  # expected by the file; 0: any
+    hz: float  # expected rate; 0: any
 
 
 @dataclass
@@ -57,13 +57,13 @@ class TopicStatistics:
 
     count: int = 0
     seconds: float = 0.0  # from the first message to the last
-    offset_s: float | None = None  # this machine's clock - newest stamp
+    offset_s: float | None = None  # this machine's clock minus the newest stamp
     stamp_s: float = 0.0  # the newest stamp
     frame: str = ""
     child_frame: str = ""
-    tilt: bool = True  # false: an inertial unit without orientation
-    unreadable: str = ""  # why a message could not be decoded
-    unusable: str = ""  # why the driver drops the newest message
+    tilt: bool = True  # false: the messages of an IMU have no orientation
+    unreadable: str = ""  # reason: a message could not be decoded
+    unusable: str = ""  # reason: the driver drops the newest message
 
     @property
     def hz(self) -> float:
@@ -114,7 +114,7 @@ def rows(options: Ros2Options, lidar: Lidar | None = None) -> list[Row]:
 
 
 def explain(options: Ros2Options, endpoints: Sequence[GraphEndpoint]) -> str:
-    """Return the problem of the graph and its remedy as one line; empty without one."""
+    """Return up to two errors of the graph with remedies, as one line; empty without errors."""
     wrong = [f for f in graph_findings(options, endpoints) if f.verdict == "error"]
     return "; ".join(f"{each.what}: {each.text}; {each.do}" for each in wrong[:2])
 
@@ -122,29 +122,29 @@ def explain(options: Ros2Options, endpoints: Sequence[GraphEndpoint]) -> str:
 def graph_findings(
     options: Ros2Options, endpoints: Sequence[GraphEndpoint], lidar: Lidar | None = None
 ) -> list[Finding]:
-    """Return the findings of the graph for each topic."""
+    """Return one finding or more about the graph for each topic."""
     others = [each for each in endpoints if not each.ours]
     if not others:
         router = str(options.router or options.port)
         do = unreached(options.transport, options.domain, router)
         return [Finding("graph", "error", "no other node is found", do)]
     return [
-        *(_published(row, others) for row in rows(options, lidar)),
-        *_commanded(options, others),
+        *(_publisher_finding(row, others) for row in rows(options, lidar)),
+        *_command_findings(options, others),
     ]
 
 
-def _published(row: Row, others: Sequence[GraphEndpoint]) -> Finding:
-    there = [each for each in others if each.topic == row.topic and each.kind == "publisher"]
-    if not there:
-        return Finding(row.topic, "error", "it has no publisher", _elsewhere(row, others))
-    right = [each for each in there if each.type == row.type]
+def _publisher_finding(row: Row, others: Sequence[GraphEndpoint]) -> Finding:
+    publishers = [each for each in others if each.topic == row.topic and each.kind == "publisher"]
+    if not publishers:
+        return Finding(row.topic, "error", "it has no publisher", _suggestion(row, others))
+    right = [each for each in publishers if each.type == row.type]
     if not right:
         return Finding(
             row.topic,
             "error",
-            f"it is of type {there[0].type}; expected {row.type}",
-            f"name the right topic in topics.{row.part}.name, or have {there[0].node} publish "
+            f"it is of type {publishers[0].type}; expected {row.type}",
+            f"name the right topic in topics.{row.part}.name, or have {publishers[0].node} publish "
             "that type",
         )
     wrong = mismatch(right[0].qos, row.qos)
@@ -163,8 +163,8 @@ def _published(row: Row, others: Sequence[GraphEndpoint]) -> Finding:
     return Finding(row.topic, "ok", f"{row.type} of {right[0].node or 'a node'}, {right[0].qos}")
 
 
-def _elsewhere(row: Row, others: Sequence[GraphEndpoint]) -> str:
-    """Return topics of the same type, or of a similar name."""
+def _suggestion(row: Row, others: Sequence[GraphEndpoint]) -> str:
+    """Return a remedy for a missing topic: names topics of its type, or one of a similar name."""
     publishers = [each for each in others if each.kind == "publisher"]
     same = sorted({each.topic for each in publishers if each.type == row.type})
     if same:
@@ -177,56 +177,60 @@ def _elsewhere(row: Row, others: Sequence[GraphEndpoint]) -> str:
     return f"{like}start the node that publishes it, or leave topics.{row.part} out"
 
 
-def _commanded(options: Ros2Options, others: Sequence[GraphEndpoint]) -> list[Finding]:
+def _command_findings(options: Ros2Options, others: Sequence[GraphEndpoint]) -> list[Finding]:
     command = options.topics.command
     topic = absolute(command.name, options.namespace)
-    there = [each for each in others if each.topic == topic]
-    takers = [each for each in there if each.kind == "subscriber"]
-    right = [each for each in takers if each.type == command.type]
+    on_topic = [each for each in others if each.topic == topic]
+    subscribers = [each for each in on_topic if each.kind == "subscriber"]
+    right = [each for each in subscribers if each.type == command.type]
     offered = Qos(command.qos == "reliable")
-    if not takers:
+    if not subscribers:
         kinds = (ros2.TWIST, ros2.TWIST_STAMPED)
-        like = sorted({e.topic for e in others if e.kind == "subscriber" and e.type in kinds})
-        text = f"topics that take one: {', '.join(like[:MAX_NAMED])}; " if like else ""
+        alternatives = sorted(
+            {e.topic for e in others if e.kind == "subscriber" and e.type in kinds}
+        )
+        text = (
+            f"topics that take one: {', '.join(alternatives[:MAX_NAMED])}; " if alternatives else ""
+        )
         do = f"{text}start the robot's base node, or write topics.command.name"
         found = [Finding(topic, "error", "no node takes commands", do)]
     elif not right:
-        do = f"write topics: {{command: {{type: {takers[0].type}}}}}"
-        text = f"{takers[0].node} takes {takers[0].type}; expected {command.type}"
+        do = f"write topics: {{command: {{type: {subscribers[0].type}}}}}"
+        text = f"{subscribers[0].node} takes {subscribers[0].type}; expected {command.type}"
         found = [Finding(topic, "error", text, do)]
     elif wrong := mismatch(offered, right[0].qos):
         do = "write topics: {command: {qos: reliable}}"
         found = [Finding(topic, "error", f"no command can arrive: {wrong}", do)]
     else:
         found = [Finding(topic, "ok", f"{command.type} to {right[0].node or 'a node'}")]
-    rivals = sorted({each.node for each in there if each.kind == "publisher"})
-    rivals = [node for node in rivals if not _guards(node, options)]
+    rivals = sorted({each.node for each in on_topic if each.kind == "publisher"})
+    rivals = [node for node in rivals if not _is_ours(node, options)]
     if rivals:
         do = "stop that node: its commands bypass the gate"
         found.append(Finding(topic, "warning", f"commanded by {', '.join(rivals)} as well", do))
     return found
 
 
-def _guards(node: str, options: Ros2Options) -> bool:
+def _is_ours(node: str, options: Ros2Options) -> bool:
     """Return whether a node is our driver or its guard."""
     return node.rpartition("/")[2] in (options.node, f"{options.node}_guard")
 
 
 def findings(options: Ros2Options, lidar: Lidar | None, watched: Watched) -> list[Finding]:
-    """Return all findings after a watch: graph, then messages, stamps and frames."""
+    """Return all findings after a watch: about the graph, messages, stamps and frames."""
     found = graph_findings(options, watched.endpoints, lidar)
     bad = {each.what for each in found if each.verdict == "error"}
     if any(each.what == "graph" for each in found):
         return found
     for row in rows(options, lidar):
         if row.topic not in bad and row.part != "mounting":
-            found += _messages(row, watched.statistics.get(row.part) or TopicStatistics())
+            found += _message_findings(row, watched.statistics.get(row.part) or TopicStatistics())
     if options.mounting == "tf_static" or len(watched.frames):
-        found += _connected(options, lidar, watched)
+        found += _frame_findings(options, lidar, watched)
     return found
 
 
-def _messages(row: Row, statistics: TopicStatistics) -> list[Finding]:
+def _message_findings(row: Row, statistics: TopicStatistics) -> list[Finding]:
     if statistics.unreadable:
         do = "is it the same definition on the robot? Other distributions changed some"
         return [Finding(row.topic, "error", statistics.unreadable, do)]
@@ -244,14 +248,14 @@ def _messages(row: Row, statistics: TopicStatistics) -> list[Finding]:
         found.append(Finding(row.topic, "warning", text, do))
     if not statistics.tilt:
         found.append(Finding(row.topic, "warning", NO_TILT, ADD_ORIENTATION))
-    if wrong := _clock(row, statistics):
+    if wrong := _clock_finding(row, statistics):
         found.append(wrong)
     if not found:
         found.append(Finding(row.topic, "ok", f"{statistics.hz:.1f} Hz, stamps of this clock"))
     return found
 
 
-def _clock(row: Row, statistics: TopicStatistics) -> Finding | None:
+def _clock_finding(row: Row, statistics: TopicStatistics) -> Finding | None:
     if statistics.offset_s is None or abs(statistics.offset_s) <= CLOCK_S:
         return None
     if statistics.stamp_s == 0.0:
@@ -264,8 +268,8 @@ def _clock(row: Row, statistics: TopicStatistics) -> Finding | None:
     return Finding(row.topic, "warning", f"its stamps are {clock_text(statistics.offset_s)}", do)
 
 
-def _connected(options: Ros2Options, lidar: Lidar | None, watched: Watched) -> list[Finding]:
-    """Return findings about frames of messages that are not connected to the base."""
+def _frame_findings(options: Ros2Options, lidar: Lidar | None, watched: Watched) -> list[Finding]:
+    """Return findings about frames: connected to the base, and mounted as the file says."""
     level: Verdict = "error" if options.mounting == "tf_static" else "warning"
     base, found = options.base_frame, list[Finding]()
     frame_of: dict[str, Callable[[TopicStatistics], str]] = {

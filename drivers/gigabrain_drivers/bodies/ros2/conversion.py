@@ -1,6 +1,6 @@
 """Converts ROS messages to ours (scans, IMU, battery, joints), and our commands to ROS. Pure.
 
-Raises only Unusable, with the reason.
+All functions raise only Unusable.
 """
 
 import math
@@ -24,15 +24,15 @@ from gigabrain_zenoh.ros2.types import Types
 
 MAX_BEAMS = 20_000
 MAX_JOINTS = 64
-MAX_IMU_VALUE = 1000.0  # [m/s2] and [rad/s]; larger values are no measurements
-BEYOND_CHARGE = 0.1  # share by which a gauge may exceed empty or full
+MAX_IMU_VALUE = 1000.0  # [m/s2] and [rad/s]; larger values are impossible
+CHARGE_TOLERANCE = 0.1  # share of the full charge by which a gauge may exceed 0 % or 100 %
 NANO = 1_000_000_000
-NO_ORIENTATION = (0.0, 0.0, 0.0, 0.0)  # safety then knows no tilt
-CUT = 1e-6  # added to a rounded speed, so that a robot that truncates keeps it
+NO_ORIENTATION = (0.0, 0.0, 0.0, 0.0)  # means that the tilt is unknown
+ROUNDING_MARGIN = 1e-6  # added to a speed, so that truncation does not lose a step
 
 
 class Unusable(Exception):
-    """A message with impossible values; the text is the reason."""
+    """Raised for a message with impossible values; the text is the reason."""
 
 
 def stamp_ns(stamp: Any) -> int:
@@ -53,8 +53,8 @@ def scan_of(
 ) -> LaserScan:
     """Return the scan in the bins of `lidar`. Raises Unusable.
 
-    `place` is the mounting of the message's sensor; None: that of `lidar`. A scan from another
-    mounting is transformed, beam by beam.
+    `place` is the mounting of the message's sensor, from which each beam is transformed; None: the
+    mounting of `lidar`.
     """
     ranges = np.asarray(message.ranges, np.float64)
     if not 1 <= len(ranges) <= MAX_BEAMS:
@@ -68,12 +68,12 @@ def scan_of(
     keep = ~np.isnan(known)
     angles, known = angles[keep], known[keep]
     if place is not None:
-        angles, known = _moved(angles, known, place, lidar)
+        angles, known = _in_mounting(angles, known, place, lidar)
     return bin_scan(lidar, angles, known)
 
 
 def _distances(ranges: np.ndarray, range_max: float, options: ScanTopic) -> np.ndarray:
-    """Return distances [m]: inf for no return, nan for unknown."""
+    """Return distances [m]: inf means no return, nan unknown."""
     found = ranges.copy()
     meanings = {"no_return": np.inf, "unknown": np.nan}
     found[np.isnan(ranges)] = meanings[options.nan]
@@ -85,37 +85,37 @@ def _distances(ranges: np.ndarray, range_max: float, options: ScanTopic) -> np.n
     return found
 
 
-def _moved(
+def _in_mounting(
     angles: np.ndarray, ranges: np.ndarray, place: Transform, lidar: Lidar
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the beams as seen from the lidar's mounting in the robot's file."""
+    """Return the beams as the lidar would see them at its mounting in the robot's file."""
     directions = np.stack([np.cos(angles), np.sin(angles), np.zeros(len(angles))], axis=1)
     directions = directions @ place.turn.T
-    far = np.isinf(ranges)
-    points = np.where(far, 0.0, ranges)[:, None] * directions
+    no_return = np.isinf(ranges)
+    points = np.where(no_return, 0.0, ranges)[:, None] * directions
     points = points + place.shift - (lidar.x, lidar.y, 0.0)
-    points[far] = directions[far]
+    points[no_return] = directions[no_return]
     moved = np.arctan2(points[:, 1], points[:, 0]) - lidar.yaw
-    return moved, np.where(far, np.inf, np.hypot(points[:, 0], points[:, 1]))
+    return moved, np.where(no_return, np.inf, np.hypot(points[:, 0], points[:, 1]))
 
 
 def has_orientation(message: Any) -> bool:
-    """Return whether a sensor_msgs/Imu has an orientation: -1 in its covariance means none."""
+    """Return whether a sensor_msgs/Imu has an orientation; a covariance of -1 means none."""
     return bool(message.orientation_covariance[0] != -1.0)
 
 
 def imu_of(message: Any, turn: np.ndarray | None = None) -> ImuData:
-    """Return the reading in the body's frame; `turn` (3, 3) is the unit's rotation in it.
+    """Return the measurement in the body's frame; `turn` (3, 3) is the IMU's rotation in it.
 
-    Its orientation is NO_ORIENTATION if the message has none. Raises Unusable.
+    The orientation is NO_ORIENTATION if the message has none. Raises Unusable.
     """
-    rate, pull = message.angular_velocity, message.linear_acceleration
+    rate, acceleration = message.angular_velocity, message.linear_acceleration
     rates = np.array([rate.x, rate.y, rate.z])
-    pulls = np.array([pull.x, pull.y, pull.z])
-    if not (np.abs(np.concatenate([rates, pulls])) < MAX_IMU_VALUE).all():
+    accels = np.array([acceleration.x, acceleration.y, acceleration.z])
+    if not (np.abs(np.concatenate([rates, accels])) < MAX_IMU_VALUE).all():
         raise Unusable("its rates or accelerations are no possible numbers")
     turn = np.eye(3) if turn is None else turn
-    rates, pulls = turn @ rates, turn @ pulls
+    rates, accels = turn @ rates, turn @ accels
     orientation = NO_ORIENTATION
     if has_orientation(message):
         at = message.orientation
@@ -126,7 +126,7 @@ def imu_of(message: Any, turn: np.ndarray | None = None) -> ImuData:
     return ImuData(
         orientation=orientation,
         angular_velocity=(float(rates[0]), float(rates[1]), float(rates[2])),
-        linear_acceleration=(float(pulls[0]), float(pulls[1]), float(pulls[2])),
+        linear_acceleration=(float(accels[0]), float(accels[1]), float(accels[2])),
     )
 
 
@@ -152,7 +152,7 @@ def battery_of(message: Any, options: BatteryTopic) -> Battery:
     volts, share = float(message.voltage), float(message.percentage)
     if not math.isfinite(volts) or not math.isfinite(share):
         raise Unusable("it has no voltage or no percentage")
-    if abs(share / options.full - 0.5) > 0.5 + BEYOND_CHARGE:
+    if abs(share / options.full - 0.5) > 0.5 + CHARGE_TOLERANCE:
         percent = share > 0 and options.full == 1
         hint = ", or write battery: {full: 100}" if percent else ""
         raise Unusable(f"its percentage is {share:g}; expected 0 to {options.full}{hint}")
@@ -160,7 +160,7 @@ def battery_of(message: Any, options: BatteryTopic) -> Battery:
     return Battery(
         voltage=max(volts, 0.0),
         percentage=min(max(100.0 * share / options.full, 0.0), 100.0),
-        current=-current if math.isfinite(current) else 0.0,  # in ROS negative while it discharges
+        current=-current if math.isfinite(current) else 0.0,  # negative in ROS while discharging
     )
 
 
@@ -187,21 +187,22 @@ def joints_of(message: Any, options: JointsTopic) -> tuple[Joint, ...]:
 
 
 def cut(velocity: Velocity, step: float) -> Velocity:
-    """Return the velocity that a robot with this step executes: truncated to a multiple."""
+    """Return the velocity that a robot executes: truncated to multiples of `step`; 0: all."""
     if not step:
         return velocity
     parts = (velocity.linear_x, velocity.linear_y, velocity.angular_z)
     x, y, z = (
-        math.copysign(math.floor(abs(part) / step + CUT) * step, part) + 0.0 for part in parts
+        math.copysign(math.floor(abs(part) / step + ROUNDING_MARGIN) * step, part) + 0.0
+        for part in parts
     )
     return Velocity(linear_x=x, linear_y=y, angular_z=z)
 
 
 def command_message(types: Types, to: Velocity, options: CommandTopic, unix_ns: int) -> Any:
-    """Return the message of a command."""
-    beyond = CUT if options.step else 0.0
+    """Return the ROS message of a command, stamped with `unix_ns` if its type has a header."""
+    margin = ROUNDING_MARGIN if options.step else 0.0
     x, y, z = (
-        part + math.copysign(beyond, part) if part else 0.0
+        part + math.copysign(margin, part) if part else 0.0
         for part in (to.linear_x, to.linear_y, to.angular_z)
     )
     twist = {"linear": {"x": x, "y": y}, "angular": {"z": z}}

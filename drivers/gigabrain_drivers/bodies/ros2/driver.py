@@ -1,7 +1,7 @@
-"""A ROS 2 robot as a body: its topics are the sensors, and it obeys a command topic.
+"""Driver of a ROS 2 robot: its topics are the sensors, and it obeys a command topic.
 
-The driver sends a new command at once, and repeats it. Without commands it sends zero. A robot that
-would keep driving without messages also gets a guard, for the case that the driver itself dies.
+The driver sends a new command at once, and repeats it. Without commands it sends zero. For a robot
+that would keep driving without messages, a guard process sends zero if the driver dies.
 """
 
 import asyncio
@@ -50,15 +50,15 @@ from gigabrain_zenoh.logs import Fault
 log = logging.getLogger(__name__)
 
 NUMBERS = re.compile(r"[\d.]+")
-COMMAND_TIMEOUT_NS = 80_000_000  # after this time without a command, so that zero is sent by 100 ms
-GUARD_PERIOD_NS = 20_000_000  # between two checks by the driver
-REST_NS = 800_000_000  # longest time of sending zero at close, until the robot stands
+COMMAND_TIMEOUT_NS = 80_000_000  # without a command; zero is then sent within 100 ms
+CHECK_PERIOD_NS = 20_000_000
+REST_TIMEOUT_NS = 800_000_000  # at close, for the robot to come to rest
 STAMP_WRAP_MS = 1 << 40
-LOG_AFTER_NS = 500_000_000  # a problem is logged after this time
+LOG_AFTER_NS = 500_000_000  # a shorter problem is not logged
 
 
 class Ros2Driver(Driver):
-    """Joins ROS 2 as a node, with the robot's topics."""
+    """Drives a ROS 2 robot by a node on its network."""
 
     Options = Ros2Options
 
@@ -71,7 +71,7 @@ class Ros2Driver(Driver):
         clock: Clock | None = None,
         opener: Opener | None = None,
     ) -> None:
-        """`opener` replaces the transport in the options; then there is no guard."""
+        """Prepare. `opener` replaces the transport in the options, and then there is no guard."""
         super().__init__(robot, options, run)
         self._clock = clock or Clock()
         topics = options.topics
@@ -89,13 +89,13 @@ class Ros2Driver(Driver):
         self._frames = FrameTree()
         self._battery, self._imu = Recent[Battery](), Recent[ImuData]()
         self._joints = Recent[tuple[Joint, ...]]()
-        self._wanted = ZERO
-        self._sent_ns = self._well_ns = self._clock.now_ns()
+        self._command = ZERO
+        self._sent_ns = self._connected_ns = self._clock.now_ns()
         self._commanded_ns = self._clock.now_ns()
-        # a little early, because checks are periodic
-        self._repeat_ns = round(1e9 / topics.command.hz) - GUARD_PERIOD_NS // 2
+        # half a check period early, because checks are periodic
+        self._repeat_ns = round(1e9 / topics.command.hz) - CHECK_PERIOD_NS // 2
         self._connected, self._found, self._reconnects = False, False, 0
-        self._fault, self._named = Fault(log), ""
+        self._fault, self._logged_kind = Fault(log), ""
         self._no_tilt = Fault(log)
         self._task: asyncio.Task[None] | None = None
         self._lidar: ScanSource | None = None
@@ -109,7 +109,7 @@ class Ros2Driver(Driver):
 
     @property
     def problem(self) -> str:
-        """The reason in one line why the body cannot be driven, or an empty text."""
+        """The reason why the body cannot be driven, in one line; empty if it can."""
         if self.link.problem:
             return self.link.problem
         now_ns = self._clock.now_ns()
@@ -120,7 +120,7 @@ class Ros2Driver(Driver):
         return self._guard.problem if self._guard else ""
 
     async def open(self) -> None:
-        """Start joining ROS 2; the robot may appear later."""
+        """Start joining ROS 2 in the background; the robot may appear later."""
         self.link.open()
         if self._guard:
             self._guard.open()
@@ -128,7 +128,7 @@ class Ros2Driver(Driver):
         self._task = asyncio.create_task(self._repeat(), name="ros2 commands")
 
     async def close(self) -> None:
-        """Send zero until the robot stands, and leave ROS 2."""
+        """Send zero until the robot is at rest, and leave ROS 2."""
         task, self._task = self._task, None
         await self.stop()
         if task:
@@ -150,20 +150,20 @@ class Ros2Driver(Driver):
     async def set_base_velocity(
         self, linear_x: float, linear_y: float, angular_z: float
     ) -> Velocity:
-        """Drive, in the robot's steps. All speeds are zero if one is not a number."""
+        """Send a velocity, cut to the robot's steps; zero if a speed is not a number."""
         self._commanded_ns = self._clock.now_ns()
         wanted = cut(self.bounded(linear_x, linear_y, angular_z), self.options.topics.command.step)
         if not self._found:  # do not command a robot before its first message
             wanted = ZERO
         due = self._commanded_ns - self._sent_ns >= self._repeat_ns
-        if wanted == self._wanted and not due:
+        if wanted == self._command and not due:
             return wanted
         return wanted if self._send(wanted) else ZERO
 
     async def read_state(self) -> RobotState:
-        """Return the newest values; its `link` shows whether they are recent."""
+        """Return the newest values; `link` in it tells whether they are recent."""
         now_ns = self._clock.now_ns()
-        self._judge(now_ns)
+        self._update_link(now_ns)
         return RobotState(
             robot_type=self.robot.robot_type,
             pose=self._watch.pose,
@@ -202,45 +202,45 @@ class Ros2Driver(Driver):
         self._send(ZERO)
 
     def _send(self, wanted: Velocity) -> bool:
-        self._wanted, self._sent_ns = wanted, self._clock.now_ns()
+        self._command, self._sent_ns = wanted, self._clock.now_ns()
         if self._guard:
             self._guard.tell(moving=wanted != ZERO)
         return self.link.send(wanted)
 
     async def _repeat(self) -> None:
-        """Repeat the newest command; send zero while there is none."""
-        async for now_ns in self._clock.every(GUARD_PERIOD_NS):
-            if now_ns - self._commanded_ns >= COMMAND_TIMEOUT_NS and self._wanted != ZERO:
+        """Repeat the newest command; send zero after COMMAND_TIMEOUT_NS without one."""
+        async for now_ns in self._clock.every(CHECK_PERIOD_NS):
+            if now_ns - self._commanded_ns >= COMMAND_TIMEOUT_NS and self._command != ZERO:
                 self._send(ZERO)
             elif now_ns - self._sent_ns >= self._repeat_ns:
-                self._send(self._wanted)
-            self._judge(now_ns)
+                self._send(self._command)
+            self._update_link(now_ns)
 
     async def _come_to_rest(self) -> None:
-        end_ns = self._clock.now_ns() + REST_NS
+        end_ns = self._clock.now_ns() + REST_TIMEOUT_NS
         while self._connected and self._clock.now_ns() < end_ns:
             now = self._watch.velocity
             if max(abs(now.linear_x), abs(now.linear_y), abs(now.angular_z)) < AT_REST_SPEED:
                 return
-            await self._clock.sleep_ns(GUARD_PERIOD_NS)
-            self._judge(self._clock.now_ns())
+            await self._clock.sleep_ns(CHECK_PERIOD_NS)
+            self._update_link(self._clock.now_ns())
 
-    def _judge(self, now_ns: int) -> None:
-        """Check whether the link is lost or found, and log changes."""
+    def _update_link(self, now_ns: int) -> None:
+        """Update whether the link is up, stop the robot if it is lost, and log changes."""
         problem = self.problem
         if not problem:
             self._reconnects += self._found and not self._connected
             self._connected = self._found = True
-            self._well_ns, self._named = now_ns, ""
+            self._connected_ns, self._logged_kind = now_ns, ""
             self._fault.end(f"{self.link}: the robot is there")
             return
         if self._connected:
             self._send(ZERO)
         self._connected = False
-        kind = NUMBERS.sub("", problem)  # another duration is the same problem
-        if kind == self._named or now_ns - self._well_ns < LOG_AFTER_NS:
+        kind = NUMBERS.sub("", problem)  # ignores numbers, such as durations
+        if kind == self._logged_kind or now_ns - self._connected_ns < LOG_AFTER_NS:
             return
-        self._named = kind
+        self._logged_kind = kind
         transport = self.link.transport
         more = explain(self.options, transport.endpoints()) if transport else ""
         self._fault.end(f"{self.link}: now something else is wrong")
@@ -256,13 +256,13 @@ class Ros2Driver(Driver):
             self._watch.refuse(str(error), now_ns)
             raise
         if place is not None:
-            pose, velocity = _moved(pose, velocity, place)
+            pose, velocity = _of_body(pose, velocity, place)
         sample = OdometrySample(stamp_ns(message.header.stamp), pose, velocity)
         self._watch.add(sample, now_ns)
         self._stamps.arrived(sample.stamp_ns // 1_000_000 % STAMP_WRAP_MS, now_ns)
 
     def _place_of_odometry(self, frame: str) -> Floats | None:
-        """Return the body's pose (3,) in the odometry's child frame. Raises Unusable."""
+        """Return the body's pose (3,) in the child frame; None: the same pose. Raises Unusable."""
         topic = self.options.topics.odometry
         if topic.child_frame and frame.lstrip("/") != topic.child_frame.lstrip("/"):
             raise Unusable(f"its child frame is {frame!r}; expected {topic.child_frame!r}")
@@ -328,7 +328,7 @@ def _pose(x: float, y: float, yaw: float) -> Floats:
 
 
 def _velocity(twist: Any) -> Velocity:
-    """Return the planar velocity of a twist; keeps NaN, for the watch to detect."""
+    """Return the planar velocity of a twist. The watch rejects NaN."""
     return Velocity(
         linear_x=float(twist.linear.x),
         linear_y=float(twist.linear.y),
@@ -336,14 +336,14 @@ def _velocity(twist: Any) -> Velocity:
     )
 
 
-def _moved(pose: Floats, velocity: Velocity, body: Floats) -> tuple[Floats, Velocity]:
-    """Return pose and velocity of the body, whose pose in the measured frame is `body`.
+def _of_body(pose: Floats, velocity: Velocity, body: Floats) -> tuple[Floats, Velocity]:
+    """Return pose and velocity of the body from those of the child frame.
 
-    The pose is relative to the body's start.
+    `body` is the body's pose in that frame. The returned pose is relative to the body's start.
     """
-    whole = se2.compose(se2.inverse(body), se2.compose(pose, body))
-    turn = velocity.angular_z
-    x = velocity.linear_x - turn * float(body[1])
-    y = velocity.linear_y + turn * float(body[0])
+    moved = se2.compose(se2.inverse(body), se2.compose(pose, body))
+    rate = velocity.angular_z
+    x = velocity.linear_x - rate * float(body[1])
+    y = velocity.linear_y + rate * float(body[0])
     cos, sin = math.cos(body[2]), math.sin(body[2])
-    return whole, Velocity(linear_x=cos * x + sin * y, linear_y=cos * y - sin * x, angular_z=turn)
+    return moved, Velocity(linear_x=cos * x + sin * y, linear_y=cos * y - sin * x, angular_z=rate)

@@ -1,6 +1,6 @@
-"""An emulated ROS 2 robot: its nodes and its board, with simulated physics.
+"""Emulates a ROS 2 robot: its nodes and its board, with simulated physics.
 
-As with a TurtleBot3, a command holds until the next one, without a time limit, unless the robot's
+As in a TurtleBot3, a command is valid until the next one, without a time limit, unless the robot's
 file promises a watchdog. If the nodes freeze or end, the board stops the motors.
 """
 
@@ -38,20 +38,20 @@ log = logging.getLogger(__name__)
 
 NODE = "emulated_robot"
 HEARTBEAT_NS = 500_000_000  # the board stops the motors after this time without its nodes
-END = b"\0"  # of a topic's name, in a frame between device and port
-QUEUE = 10  # newest commands that a frozen node keeps
-DOMAINS = range(101, 200)  # for emulators; their ports are below Linux's ephemeral ports
+NAME_END = b"\0"  # after a topic's name, in a frame between device and port
+QUEUE = 10  # commands that wait while the node is frozen
+DOMAINS = range(101, 200)  # for emulators, with ports below Linux's ephemeral ones
 BASE, ODOM, SCAN_FRAME, IMU_FRAME = "base_footprint", "odom", "base_scan", "imu_link"
 LIDAR_HEIGHT_M = 0.182
 
 
 def frame(topic: str, payload: bytes) -> bytes:
-    """Return a message as a frame between device and port."""
-    return topic.encode() + END + payload
+    """Encode a message as a frame between device and port."""
+    return topic.encode() + NAME_END + payload
 
 
 class RosPort:
-    """The robot's nodes on a transport; the file `path` contains their address."""
+    """The robot's nodes on a transport; their address is in the file `path`."""
 
     def __init__(self, path: Path, options: Ros2Options) -> None:
         self.path, self._options = path, options
@@ -63,14 +63,14 @@ class RosPort:
         self._endings: set[asyncio.Task[None]] = set()
 
     def plug(self) -> None:
-        """Start the nodes. Does nothing if they run."""
+        """Start the nodes. Does nothing if they are running."""
         if self._plugged:
             return
         self._plugged = True
         self._running = asyncio.create_task(self._run(self._running), name="emulated nodes")
 
     def unplug(self) -> None:
-        """End the nodes. Does nothing if they are gone."""
+        """End the nodes. Does nothing if they have ended."""
         self._plugged = False
         self._publishers = {}
         if self._running and not self._running.done():
@@ -79,17 +79,17 @@ class RosPort:
             self._running.add_done_callback(self._endings.discard)
 
     def write(self, data: bytes) -> bool:
-        """Publish a frame. Return False while the nodes are gone."""
-        name, _, payload = data.partition(END)
+        """Publish a frame; return False while the nodes are unplugged."""
+        name, _, payload = data.partition(NAME_END)
         publisher = self._publishers.get(name.decode("ascii", "replace"))
         if publisher:
             publisher.publish(payload)
         return self._plugged
 
-    async def _run(self, before: "asyncio.Task[None] | None") -> None:
-        """Run the nodes until cancelled, after the end of those `before`."""
-        if before:
-            await asyncio.wait((before,))
+    async def _run(self, previous: "asyncio.Task[None] | None") -> None:
+        """Run the nodes until cancelled, once the previous task has ended."""
+        if previous:
+            await asyncio.wait((previous,))
         fault = Fault(log)
         while True:
             try:
@@ -120,9 +120,9 @@ class RosPort:
             link = msgspec.structs.replace(link, **changes)
             transport = await stack.enter_async_context(open_transport(link, types))
             self.path.parent.mkdir(parents=True, exist_ok=True)
-            fresh = self.path.with_name(f".{self.path.name}.new")
-            fresh.write_bytes(msgspec.json.encode(address))
-            fresh.replace(self.path)
+            new = self.path.with_name(f".{self.path.name}.new")
+            new.write_bytes(msgspec.json.encode(address))
+            new.replace(self.path)
             stack.callback(self.path.unlink, missing_ok=True)
             yield transport
 
@@ -135,16 +135,16 @@ class RosPort:
             command.name,
             command.type,
             Qos(depth=QUEUE),
-            lambda received: self._received(command.name, received.payload),
+            lambda received: self._on_received(command.name, received.payload),
         )
 
-    def _received(self, topic: str, payload: bytes) -> None:
+    def _on_received(self, topic: str, payload: bytes) -> None:
         if self._plugged:
             self.on_bytes(frame(topic, payload))
 
 
 def _free_address(options: Ros2Options) -> Address:
-    """Return an unused address. It stays the same when the nodes restart."""
+    """Return an unused address. The caller keeps it when the nodes restart."""
     if options.transport == "dds":
         return Address(domain=free_domain())
     with socket.socket() as probe:
@@ -170,7 +170,7 @@ def free_domain() -> int:
 
 
 def published(options: Ros2Options) -> list[tuple[str, str, Qos]]:
-    """Return topic, type and offered QoS of everything that a robot publishes."""
+    """Return (topic, type, offered QoS) of all topics that a robot publishes."""
     topics = options.topics
     found = [(topics.odometry.name, ros2.ODOMETRY, Qos())]
     if topics.scan:
@@ -189,7 +189,7 @@ def published(options: Ros2Options) -> list[tuple[str, str, Qos]]:
 
 
 class Ros2Robot(Device):
-    """Publishes its sensors at the rates of its file, and obeys its command topic."""
+    """Publishes sensor data at the rates in the robot's file, and obeys its command topic."""
 
     Options = Ros2Options
     period_s = 0.01
@@ -214,13 +214,13 @@ class Ros2Robot(Device):
 
     @classmethod
     def port(cls, options: Any) -> Port:
-        """Return nodes on the transport of the options; a file contains their address."""
+        """Return the nodes on the transport; the file `options.port` has their address."""
         return RosPort(Path(options.port), options)
 
     def reset(self) -> None:
-        """Start: wheels at rest, odometry at zero."""
+        """Restart: wheels at rest, odometry at zero."""
         self._obeyed_ns: int | None = None
-        self._alive_ns: int | None = None  # last time at which the nodes ran
+        self._alive_ns: int | None = None  # the newest time at which the nodes ran
         self._next_ns = self._static_ns = 0
         self._start = self.body.snapshot.odometry
         self.body.command(0.0, 0.0, 0.0)
@@ -229,9 +229,9 @@ class Ros2Robot(Device):
             self._sweep.start(beams * hz, hz)
 
     def feed(self, data: bytes) -> None:
-        """Obey commands; at most the ten newest of those that waited."""
+        """Obey received commands, at most the QUEUE newest ones."""
         command = self._options.topics.command
-        name = command.name.encode() + END
+        name = command.name.encode() + NAME_END
         for payload in data.split(name)[1:][-QUEUE:]:
             with contextlib.suppress(BadPayload):
                 self._obey(self._types.decode(command.type, payload))
@@ -249,12 +249,12 @@ class Ros2Robot(Device):
         self.body.command(wanted.linear_x, wanted.linear_y, wanted.angular_z)
 
     def step(self, now_ns: int) -> None:
-        """Watch nodes and commands, and publish due messages."""
+        """Stop the motors if nodes or commands are missing, and publish due messages."""
         if not self.halted or self._alive_ns is None:
             self._alive_ns = now_ns
-        silent = self._watchdog_ns and self._obeyed_ns
+        watched_ns = self._watchdog_ns and self._obeyed_ns
         if now_ns - self._alive_ns >= HEARTBEAT_NS or (
-            silent and now_ns - silent >= (self._watchdog_ns or 0)
+            watched_ns and now_ns - watched_ns >= (self._watchdog_ns or 0)
         ):
             self.body.command(0.0, 0.0, 0.0)
         self._scan()
@@ -262,19 +262,19 @@ class Ros2Robot(Device):
             return
         self._next_ns = max(self._next_ns + self._state_ns, now_ns - self._state_ns)
         self._report()
-        if now_ns >= self._static_ns:  # for late subscribers without stored messages
+        if now_ns >= self._static_ns:  # repeated for late subscribers that are volatile
             self._static_ns = now_ns + NANO
-            self._send(ros2.TF_STATIC_TOPIC, ros2.TF, transforms=self._fixed())
+            self._send(ros2.TF_STATIC_TOPIC, ros2.TF, transforms=self._static_transforms())
 
     def _send(self, topic: str, type: str, **fields: Any) -> None:
         payload = self._types.encode(type, self._types.make(type, **fields))
         self.wire.write(frame(topic, payload))
 
     def _report(self) -> None:
-        shot, topics = self.body.snapshot, self._options.topics
-        odometry, began = shot.odometry, self._start
+        snapshot, topics = self.body.snapshot, self._options.topics
+        odometry, start = snapshot.odometry, self._start
         yaw = odometry.yaw
-        position = {"x": odometry.x - began.x, "y": odometry.y - began.y}
+        position = {"x": odometry.x - start.x, "y": odometry.y - start.y}
         pose = {"position": position, "orientation": _heading(yaw)}
         twist = {"linear": {"x": odometry.linear_x}, "angular": {"z": odometry.angular_z}}
         self._send(
@@ -289,11 +289,11 @@ class Ros2Robot(Device):
         link = {"header": _header(ODOM), "child_frame_id": BASE, "transform": moved}
         self._send(ros2.TF_TOPIC, ros2.TF, transforms=[link])
         if topics.imu:
-            self._send(topics.imu.name, ros2.IMU, **_imu(shot.imu))
+            self._send(topics.imu.name, ros2.IMU, **_imu(snapshot.imu))
         if topics.battery:
-            volts = max(shot.battery.voltage - self.sag_volts, 0.0)
-            share = shot.battery.percentage / 100 * topics.battery.full
-            values = {"voltage": volts, "percentage": share, "current": -shot.battery.current}
+            volts = max(snapshot.battery.voltage - self.sag_volts, 0.0)
+            share = snapshot.battery.percentage / 100 * topics.battery.full
+            values = {"voltage": volts, "percentage": share, "current": -snapshot.battery.current}
             self._send(topics.battery.name, ros2.BATTERY, header=_header(""), **values)
         if topics.joints:
             factor = topics.joints.velocity_factor or 1.0
@@ -301,9 +301,9 @@ class Ros2Robot(Device):
                 topics.joints.name,
                 ros2.JOINTS,
                 header=_header("base_link"),
-                name=[wheel.name for wheel in shot.wheels],
-                position=np.array([wheel.position for wheel in shot.wheels]),
-                velocity=np.array([wheel.velocity / factor for wheel in shot.wheels]),
+                name=[wheel.name for wheel in snapshot.wheels],
+                position=np.array([wheel.position for wheel in snapshot.wheels]),
+                velocity=np.array([wheel.velocity / factor for wheel in snapshot.wheels]),
                 effort=np.array([]),
             )
 
@@ -333,8 +333,8 @@ class Ros2Robot(Device):
             intensities=np.array([], np.float32),
         )
 
-    def _fixed(self) -> list[dict[str, Any]]:
-        """Return the transforms of static frames."""
+    def _static_transforms(self) -> list[dict[str, Any]]:
+        """Return the static transforms of the sensors."""
         lidar = self._lidar
         places: dict[str, tuple[float, float, float, float]] = {IMU_FRAME: (0.0, 0.0, 0.068, 0.0)}
         if lidar:

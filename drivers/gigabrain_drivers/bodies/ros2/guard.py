@@ -1,9 +1,9 @@
 """A process that stops a ROS 2 robot when its driver dies or hangs.
 
-A robot without its own watchdog drives on for ever when its commands end. So the driver starts this
-process, which has its own node, and reports each command to it: moving, or at rest. When reports of
-a moving robot end, or the driver is gone, it sends zero. It cannot help if the network between this
-machine and the robot is cut.
+A robot without a watchdog of its own drives on for ever when its commands end. So the driver
+starts this process, which has its own node, and reports each command to it: moving, or at rest.
+The guard sends zero if the reports of a moving robot end, or the driver ends. It cannot help if
+the network between this machine and the robot is cut.
 """
 
 import asyncio
@@ -23,33 +23,33 @@ from gigabrain_drivers.links.line_guard import AT_REST, MOVING, QUIT, GuardState
 from gigabrain_schemas.base import Velocity
 from gigabrain_zenoh.clock import Clock
 
-SILENCE_NS = 150_000_000  # from the last report of a moving robot to zero
-ZEROS_NS = 1_000_000_000  # zero is repeated this long, as a single message may get lost
+SILENCE_NS = 150_000_000  # zero is sent after this time without a report of a moving robot
+ZEROS_NS = 1_000_000_000  # zero is repeated for this time, because a message may get lost
 PERIOD_NS = 20_000_000
 REPORT_NS = 500_000_000  # between two reports to the driver
-LOST_NS = 3_000_000_000  # the driver counts the guard as lost after this time without a report
-RESTART_NS = 500_000_000
-CLOSE_S = 1.0  # timeout for its own link
-END_S = 2.0  # timeout for the whole process
-START_S = 60.0  # for its first report on a busy machine, which a restart would only delay
-MAX_CHARS = 200  # of a fault
+LOST_NS = 3_000_000_000  # the driver restarts the guard after this time without a report
+RESTART_NS = 500_000_000  # delay
+CLOSE_S = 1.0  # timeout for leaving ROS 2
+END_S = 2.0  # timeout for the end of the process
+START_S = 60.0  # timeout for the first report; long, because a restart would delay it further
+MAX_CHARS = 200  # in the text of a fault
 GUARD = "the guard, which stops the robot if this driver dies,"
 
 
 class Guard:
-    """The driver's end: starts the process, and restarts it if it ends."""
+    """The driver's side: starts the guard process, and restarts it if it ends or hangs."""
 
     def __init__(self, options: Ros2Options, clock: Clock, reached: Callable[[], object]) -> None:
         """`reached` returns whether the driver itself reaches the robot."""
         self._options, self._clock, self._reached = options, clock, reached
         self._process: asyncio.subprocess.Process | None = None
         self._received_ns: int | None = None
-        self._readers, self._fault = 0, ""  # the fault of the previous process
+        self._readers, self._fault = 0, ""  # of the present process; of the previous process
         self._task: asyncio.Task[None] | None = None
 
     @property
     def problem(self) -> str:
-        """Return why the guard could not stop the robot; empty if it could."""
+        """The reason why the guard could not stop the robot; empty if it could."""
         if self._received_ns is None:
             return f"{GUARD} {self._fault or 'is starting'}"
         if self._clock.now_ns() - self._received_ns > LOST_NS:
@@ -59,12 +59,12 @@ class Guard:
         return ""
 
     def open(self) -> None:
-        """Start it in the background."""
+        """Start the process in the background."""
         if self._task is None:
-            self._task = asyncio.create_task(self._keep(), name="guard")
+            self._task = asyncio.create_task(self._keep_running(), name="guard")
 
     def tell(self, *, moving: bool) -> None:
-        """Report a sent command to it."""
+        """Report a sent command to the process."""
         self._write(MOVING if moving else AT_REST)
 
     async def close(self) -> None:
@@ -82,7 +82,7 @@ class Guard:
             with contextlib.suppress(ConnectionError, RuntimeError):
                 process.stdin.write(word)
 
-    async def _keep(self) -> None:
+    async def _keep_running(self) -> None:
         while True:
             try:
                 self._fault = f"{await self._run()}; starting it again"
@@ -103,38 +103,39 @@ class Guard:
         )
 
     async def _run(self) -> str:
-        """Start the process, and receive its reports; return why it no longer works."""
+        """Start the process, and receive its reports; return the reason of its end."""
         try:
             process = self._process = await self._start()
         except OSError as error:
             return f"cannot be started: {error}"
         assert process.stdout
         assert process.stdin
-        alone_ns: int | None = None  # time of its first report
+        # the newest report without a fault: the first, or with readers, or if the driver has none
+        well_ns: int | None = None
         try:
-            while alone_ns is None or self._clock.now_ns() - alone_ns < LOST_NS:  # else: not joined
+            while well_ns is None or self._clock.now_ns() - well_ns < LOST_NS:
                 async with asyncio.timeout(START_S if self._received_ns is None else LOST_NS / 1e9):
                     line = await process.stdout.readline()
                 if not line:
                     return "has ended"
                 self._readers = int(line)
                 self._received_ns = self._clock.now_ns()
-                if alone_ns is None or self._readers or not self._reached():
-                    alone_ns = self._received_ns
+                if well_ns is None or self._readers or not self._reached():
+                    well_ns = self._received_ns
             return "does not reach the robot, which this driver does"
         except TimeoutError:
             return "does not answer"
         except ValueError as error:
             return f"printed something other than a number: {str(error)[:MAX_CHARS]}"
         finally:
-            process.stdin.close()  # this ends it
-            await _ended(process, 0.0 if self._task else END_S)  # a lost one may hang
+            process.stdin.close()  # ends the process
+            await _wait_or_kill(process, 0.0 if self._task else END_S)  # a faulty one may hang
 
 
-async def _ended(process: asyncio.subprocess.Process, within_s: float) -> None:
-    """Wait until a process has ended; kill it after `within_s`."""
+async def _wait_or_kill(process: asyncio.subprocess.Process, timeout_s: float) -> None:
+    """Wait for the end of a process; kill it after `timeout_s`."""
     try:
-        async with asyncio.timeout(within_s):
+        async with asyncio.timeout(timeout_s):
             await process.wait()
     except TimeoutError:
         with contextlib.suppress(ProcessLookupError):
@@ -143,7 +144,7 @@ async def _ended(process: asyncio.subprocess.Process, within_s: float) -> None:
 
 
 async def guard(options: Ros2Options) -> None:
-    """Guard the robot until the driver has ended and zero was sent."""
+    """Guard the robot until the driver ends, then send zero, and end the process."""
     clock, state = Clock(), GuardState(SILENCE_NS, ZEROS_NS)
     link = RosLink(msgspec.structs.replace(options, node=f"{options.node}_guard"[:64]), clock)
     link.open()
@@ -158,14 +159,14 @@ async def guard(options: Ros2Options) -> None:
                 loop.remove_reader(sys.stdin.fileno())
 
     loop.add_reader(sys.stdin.fileno(), read)
-    told_ns = -REPORT_NS
+    reported_ns = -REPORT_NS
     async for now_ns in clock.every(PERIOD_NS):
         if state.stops(now_ns):
             link.send(Velocity())
         if state.ended(now_ns):
             break
-        if link.transport and now_ns - told_ns >= REPORT_NS and not state.gone:
-            told_ns = now_ns
+        if link.transport and now_ns - reported_ns >= REPORT_NS and not state.gone:
+            reported_ns = now_ns
             with contextlib.suppress(BrokenPipeError):
                 print(link.readers, flush=True)
     with contextlib.suppress(TimeoutError):
@@ -175,7 +176,7 @@ async def guard(options: Ros2Options) -> None:
 
 
 def main(words: list[str]) -> None:
-    """Run the guard of the link whose options are given as JSON."""
+    """Run the guard; its only argument is the driver's options as JSON."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C ends it through the driver
     options: Any = msgspec.convert(json.loads(words[0]), Ros2Options)
     asyncio.run(guard(options))

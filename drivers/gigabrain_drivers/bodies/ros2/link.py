@@ -1,4 +1,4 @@
-"""A driver's node: joins ROS 2, listens to the robot's topics, and commands it.
+"""A driver's node: joins ROS 2, subscribes to the robot's topics, and commands it.
 
 It tries to join again until it is closed. Everything runs on the event loop.
 """
@@ -30,8 +30,8 @@ log = logging.getLogger(__name__)
 RETRY_NS = 200_000_000  # between two attempts to join
 ADDRESS_CHECK_NS = 1_000_000_000  # between two checks of this host's addresses
 CLOSE_S = 1.0  # timeout for leaving
-DEPTH = 5  # newest messages that wait for a busy loop
-STATIC_DEPTH = 100  # publishers of /tf_static keep one message each
+DEPTH = 5  # messages that wait for a busy loop
+STATIC_DEPTH = 100  # for /tf_static, where each publisher keeps one message
 
 Opener = Callable[[], AbstractAsyncContextManager[RosTransport]]
 Take = Callable[[Any], None]  # handles a message; may raise Unusable
@@ -39,23 +39,23 @@ Take = Callable[[Any], None]  # handles a message; may raise Unusable
 
 @functools.cache
 def all_types() -> Types:
-    """Return ROS's own types, loaded once: it takes a moment."""
+    """Return all ROS types. The first call takes a moment."""
     from gigabrain_zenoh.config.settings import Ros2Link
 
     return load_types(Ros2Link())
 
 
 class RosLink:
-    """A node on a transport, opened again whenever opening it fails."""
+    """A node on a transport, which is opened again after a failure or a change of network."""
 
     def __init__(self, options: Ros2Options, clock: Clock, opener: Opener | None = None) -> None:
         """`opener` replaces the transport in the options."""
         self._options, self._clock = options, clock
         self._opener = opener or self._open_transport
-        self.trace: Trace | None = None  # ("tx" or "rx", payload)
-        self.on_open: Callable[[], None] = _nothing
+        self.trace: Trace | None = None  # called with ("tx" or "rx", payload)
+        self.on_open: Callable[[], None] = _do_nothing
         self.problem = "not opened"
-        self.errors = 0  # unusable messages
+        self.errors = 0  # number of unusable messages
         self.transport: RosTransport | None = None
         self._topics: list[tuple[str, str, Qos, Take]] = []
         self._faults: dict[str, Fault] = {}
@@ -77,12 +77,12 @@ class RosLink:
     def listen(
         self, topic: str, type: str, take: Take, *, reliable: bool, kept: bool = False
     ) -> None:
-        """Call `take` with each message; call this before `open`. `kept`: also stored ones."""
+        """Call `take` with each message; `kept`: also with stored ones. Call this before `open`."""
         qos = Qos(reliable, kept, STATIC_DEPTH if kept else DEPTH)
         self._topics.append((topic, type, qos, take))
 
     def open(self) -> None:
-        """Join in the background. Return at once."""
+        """Start to join in the background."""
         if self._task is None:
             self.problem = "joining ROS 2"
             self._task = asyncio.create_task(self._keep_open(), name=f"link {self}")
@@ -98,14 +98,14 @@ class RosLink:
         self.problem = "closed"
 
     def send(self, to: Velocity) -> bool:
-        """Publish a command now; return whether a node receives it. Never blocks or raises."""
+        """Publish a command; return whether a node subscribes. Never blocks or raises."""
         if self._command is None or self._types is None:
             return False
         topic = self._options.topics.command
         message = command_message(self._types, to, topic, self._clock.unix_ns())
         payload = self._types.encode(topic.type, message)
         self._command.publish(payload)
-        self._show("tx", topic.name, topic.type, payload)
+        self._log_message("tx", topic.name, topic.type, payload)
         return self._command.readers > 0
 
     @contextlib.asynccontextmanager
@@ -123,25 +123,25 @@ class RosLink:
                     fault.end(f"{self}: joined")
                     self._attach(transport)
                     try:
-                        await self._until_moved()
+                        await self._until_network_changes()
                     finally:
                         self.transport = self._command = None
-            except Exception as error:  # noqa: BLE001 - such as no thread left; there may be one soon
+            except Exception as error:  # noqa: BLE001 - any failure may pass, such as a lack of threads
                 self.problem = str(error) or type(error).__name__
                 fault.begin(f"{self}: {self.problem}")
                 await self._clock.sleep_ns(RETRY_NS)
 
-    async def _until_moved(self) -> None:
-        """Return when this host has another network, and no robot is connected.
+    async def _until_network_changes(self) -> None:
+        """Return once this host has only other addresses than before, and no robot is connected.
 
-        Cyclone DDS keeps the interface on which it joined.
+        Cyclone DDS stays on the interface on which it joined.
         """
         if not self._options.bound:
             await asyncio.Event().wait()
         joined = outer_addresses()
         async for _ in self._clock.every(ADDRESS_CHECK_NS):
-            now = outer_addresses()
-            if now and not now & joined and not self.readers:
+            present = outer_addresses()
+            if present and not present & joined and not self.readers:
                 log.info("%s: the network has changed; joining again", self)
                 return
 
@@ -152,11 +152,12 @@ class RosLink:
             command.name, command.type, Qos(command.qos == "reliable", depth=1)
         )
         for topic, type, qos, take in self._topics:
-            transport.subscribe(topic, type, qos, functools.partial(self._take, topic, type, take))
+            handle = functools.partial(self._on_message, topic, type, take)
+            transport.subscribe(topic, type, qos, handle)
         self.on_open()
 
-    def _take(self, topic: str, type: str, take: Take, received: Received) -> None:
-        self._show("rx", topic, type, received.payload)
+    def _on_message(self, topic: str, type: str, take: Take, received: Received) -> None:
+        self._log_message("rx", topic, type, received.payload)
         fault = self._faults.setdefault(topic, Fault(log))
         assert self._types
         try:
@@ -167,14 +168,14 @@ class RosLink:
         else:
             fault.end(f"{topic}: its messages are good again")
 
-    def _show(self, way: str, topic: str, type: str, payload: bytes) -> None:
+    def _log_message(self, way: str, topic: str, type: str, payload: bytes) -> None:
         if self.trace:
             self.trace(way, payload)
         if links.log.isEnabledFor(logging.DEBUG):
             links.log.debug("%s %s", self, f"{way} {topic} {self._text(type, payload)}")
 
     def _text(self, type: str, payload: bytes) -> str:
-        """Describe a message in one line."""
+        """Return a message as one line of text."""
         assert self._types
         try:
             return _short(self._types.to_dict(self._types.decode(type, payload)))
@@ -182,7 +183,7 @@ class RosLink:
             return f"{payload[:16].hex()}… {error}"
 
 
-MAX_SHOWN = 6  # elements of a list
+MAX_SHOWN = 6  # elements of a list, in a log line
 
 
 def _short(value: Any) -> str:
@@ -194,5 +195,5 @@ def _short(value: Any) -> str:
     return f"{value:.4g}" if isinstance(value, float) else str(value)
 
 
-def _nothing() -> None:
+def _do_nothing() -> None:
     pass

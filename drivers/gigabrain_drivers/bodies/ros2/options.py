@@ -1,6 +1,6 @@
-"""The `driver: ros2` part of a robot's file: how to join ROS 2, and the robot's topics.
+"""Options of `driver: ros2` in a robot's file: how to join ROS 2, and the robot's topics.
 
-Each check raises ValueError as `FIELD: what is wrong; what was expected`.
+Each check raises ValueError with the text `FIELD: fault; expected …`.
 """
 
 import math
@@ -31,7 +31,7 @@ Factor = Annotated[float, Meta(ge=-1e6, le=1e6)]
 Seconds = Annotated[float, Meta(ge=0.05, le=60.0)]
 Reliability = Literal["best_effort", "reliable"]
 
-MAX_WATCHDOG_S = 0.2  # of a robot that stops by itself early enough to need no guard
+MAX_WATCHDOG_S = 0.2  # a robot with a longer watchdog needs a guard
 MAX_ADDRESS_BYTES = 512  # size of a file with an emulator's address
 
 
@@ -44,31 +44,29 @@ class CommandTopic(_Part, frozen=True, kw_only=True, forbid_unknown_fields=True)
 
     name: Topic = "cmd_vel"
     type: Literal["geometry_msgs/msg/Twist", "geometry_msgs/msg/TwistStamped"]
-    frame: Frame = "base_link"  # of TwistStamped
+    frame: Frame = "base_link"  # in the header of TwistStamped
     hz: Rate = 20.0  # repetition of an unchanged command; a new one is sent at once
-    step: Step = (
-        0.0  # [m/s] and [rad/s], to whose multiples the robot cuts its speeds; 0: it does not
-    )
-    qos: Reliability = "reliable"  # what is offered; a reliable one suits every subscriber
+    step: Step = 0.0  # [m/s] and [rad/s], the robot truncates speeds to multiples of it; 0: none
+    qos: Reliability = "reliable"  # offered; a reliable publisher matches every subscriber
 
 
 class OdometryTopic(_Part, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """The topic with pose and velocity, of nav_msgs/msg/Odometry."""
+    """The topic with pose and velocity, a nav_msgs/msg/Odometry."""
 
     name: Topic = "odom"
     hz: Rate = 20.0  # promised by the robot; the link is lost after 2.5 periods without a message
-    child_frame: Frame = ""  # that messages must have; empty: any
-    x: Offset = 0.0  # [m], place of the child frame in the body's frame
+    child_frame: Frame = ""  # required in each message; empty: any
+    x: Offset = 0.0  # [m], pose of the child frame in the body's frame
     y: Offset = 0.0  # [m]
     yaw: Angle = 0.0  # [rad]
     qos: Reliability = "best_effort"
 
 
 class ScanTopic(_Part, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """The topic with the lidar's turns, of sensor_msgs/msg/LaserScan."""
+    """The topic of the lidar, a sensor_msgs/msg/LaserScan."""
 
     name: Topic = "scan"
-    clockwise: bool = False  # beams run clockwise, contrary to the message's increment
+    clockwise: bool = False  # true: the beams run clockwise, although the message says otherwise
     angle: Angle = 0.0  # [rad], added to all angles, to correct a wrong start angle
     zero: Literal["no_return", "unknown"] = "no_return"  # meaning of a range of 0
     nan: Literal["no_return", "unknown"] = "unknown"  # meaning of a range of NaN
@@ -76,32 +74,32 @@ class ScanTopic(_Part, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
 
 class ImuTopic(_Part, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """The topic of the inertial unit, of sensor_msgs/msg/Imu."""
+    """The topic of the inertial measurement unit, a sensor_msgs/msg/Imu."""
 
     name: Topic = "imu"
-    yaw: Angle = 0.0  # [rad], of its mounting; with `mounting: tf_static` this is not used
+    yaw: Angle = 0.0  # [rad], yaw of its mounting; unused with `mounting: tf_static`
     qos: Reliability = "best_effort"
 
 
 class BatteryTopic(_Part, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """The topic of the battery, of sensor_msgs/msg/BatteryState."""
+    """The topic of the battery, a sensor_msgs/msg/BatteryState."""
 
     name: Topic = "battery_state"
-    full: Literal[1, 100] = 1  # its percentage at full charge; by ROS convention 1
+    full: Literal[1, 100] = 1  # its percentage at full charge; 1 by ROS convention
     qos: Reliability = "best_effort"
 
 
 class JointsTopic(_Part, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """The topic of the joints, of sensor_msgs/msg/JointState."""
+    """The topic of the joints, a sensor_msgs/msg/JointState."""
 
     name: Topic = "joint_states"
-    velocity_factor: Factor = 1.0  # from its velocities to rad/s
-    names: dict[str, Name] = {}  # other names for joints, by theirs
+    velocity_factor: Factor = 1.0  # converts its velocities to rad/s
+    names: dict[str, Name] = {}  # from the robot's names of joints to ours
     qos: Reliability = "best_effort"
 
 
 class Topics(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """The robot's topics. It does not have those that are omitted."""
+    """The robot's topics. An omitted topic does not exist."""
 
     command: CommandTopic
     odometry: OdometryTopic = OdometryTopic()
@@ -120,10 +118,10 @@ class Ros2Options(LinkOptions, frozen=True, kw_only=True, forbid_unknown_fields=
     node: RosName = DRIVER_NODE  # name of the driver's node
     router: str = ""  # Zenoh endpoint of the robot's ROS router, for rmw_zenoh
     distro: Literal["humble", "iron", "jazzy", "kilted", "rolling"] = "jazzy"  # of the robot
-    localhost: bool = False  # DDS connects only to nodes of this host
-    port: str = ""  # a file with an emulator's address, which replaces domain and router
+    localhost: bool = False  # true: DDS connects only to nodes of this host
+    port: str = ""  # file with an emulator's address, which replaces domain and router
     topics: Topics
-    watchdog: Seconds | Literal["none"]  # [s], the robot stops after this time without commands
+    watchdog: Seconds | Literal["none"]  # [s], after which a robot without commands stops
     mounting: Literal["file", "tf_static"] = "file"  # source of sensor mountings: this file, or ROS
     base_frame: Frame = "base_footprint"  # the body's frame in ROS
 
@@ -146,11 +144,11 @@ class Ros2Options(LinkOptions, frozen=True, kw_only=True, forbid_unknown_fields=
 
     @property
     def bound(self) -> bool:
-        """True if it is bound to the network interface on which it joined."""
+        """True if the node stays on the network interface on which it joined."""
         return self.transport == "dds" and not (self.localhost or self.port)
 
     def link(self, node: str = "") -> Ros2Link:
-        """Return how to join ROS 2. Raises ConfigError while an emulator's file is missing."""
+        """Return the settings to join ROS 2. Raises ConfigError without an emulator's file."""
         link = Ros2Link(
             transport=self.transport,
             domain=self.domain,
@@ -164,14 +162,14 @@ class Ros2Options(LinkOptions, frozen=True, kw_only=True, forbid_unknown_fields=
 
 
 class Address(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """An emulator's address, in the file of its port."""
+    """An emulator's address, as in the file `port`."""
 
     domain: Annotated[int, Meta(ge=0, le=232)] = 0
     router: str = ""
 
 
 def at_address(link: Ros2Link, path: Path) -> Ros2Link:
-    """Return the link with an emulator's address from a file. Raises ConfigError."""
+    """Return `link` with the emulator's address in a file. Raises ConfigError."""
     try:
         found = msgspec.json.decode(read_bounded(path, MAX_ADDRESS_BYTES), type=Address)
     except OSError as error:
@@ -194,11 +192,11 @@ def check_options(options: Ros2Options, robot: RobotFile) -> None:
             "topics: there is a scan, but no `lidar:` at the top of this file; expected its beams, "
             "rate_hz, range_min and range_max"
         )
-    slowest = min(robot.max_linear_speed, robot.max_angular_speed)
-    if topics.command.step > 0.25 * slowest:
+    slower_limit = min(robot.max_linear_speed, robot.max_angular_speed)
+    if topics.command.step > 0.25 * slower_limit:
         raise ValueError(
             f"topics: command: a step of {topics.command.step:g} is too coarse for a body that "
-            f"does {slowest:g} at most; expected a quarter of that or less"
+            f"does {slower_limit:g} at most; expected a quarter of that or less"
         )
     if robot.drive_type == "quadruped":
         raise ValueError("driver: ros2 drives bodies by velocity; expected another drive_type")

@@ -1,7 +1,7 @@
 """Checks that a robot's odometry arrives, is possible, and does not jump. Pure.
 
-A jump of the pose is removed, so that our odometry continues and the map stays right. The link
-still counts as lost for a moment, because the robot may have restarted.
+A jump is removed from the pose, so that the map stays correct. The link still counts as lost for
+a moment, because the robot may have restarted.
 """
 
 import math
@@ -15,15 +15,15 @@ from gigabrain_zenoh.geometry import se2
 
 LOST_PERIODS = 2.5  # the link is lost after this many periods without odometry,
 MIN_TIMEOUT_NS = 100_000_000  # but not before this time
-SETTLE_NS = 300_000_000  # of good odometry, after a fault in it
-PUSHED_FACTOR = 1.5  # factor on the maximal speed, for a body that is pushed
-MAX_FACTOR = 3.0  # factor on the maximal turn rate; larger rates are no measurements
-JUMP_M, JUMP_RAD = 0.1, 0.3  # tolerance; a larger motion between two messages is a jump
-BACK_NS = 20_000_000  # a stamp may be this much older than the last, if a publisher has two threads
+SETTLE_NS = 300_000_000  # a fault is over after this time of valid odometry
+PUSHED_FACTOR = 1.5  # a pushed body can move faster than its maximum speed by this factor
+MAX_RATE_FACTOR = 3.0  # a reported turn rate above this multiple of the maximum is impossible
+JUMP_M, JUMP_RAD = 0.1, 0.3  # tolerances of the motion between two messages
+MAX_BACK_NS = 20_000_000  # a stamp may be this much older than the last, from another thread
 
 
 class OdometrySample(NamedTuple):
-    """One odometry message in our terms."""
+    """One odometry message."""
 
     stamp_ns: int  # by the robot's clock
     pose: Floats  # (3,), in the robot's odometry frame
@@ -31,18 +31,18 @@ class OdometrySample(NamedTuple):
 
 
 class OdometryWatch:
-    """Keeps the newest odometry, and its present problem."""
+    """Keeps the newest odometry, and the problem that it has."""
 
     def __init__(self, topic: str, hz: float, max_speed: float, max_turn: float) -> None:
         """`max_speed` [m/s] and `max_turn` [rad/s] are the body's limits."""
         self.timeout_ns = max(round(LOST_PERIODS / hz * 1e9), MIN_TIMEOUT_NS)
         self.errors = 0  # rejected messages
         self.velocity = Velocity()
-        self._topic, self._speed, self._turn = topic, max_speed, max_turn
-        self._pose: Floats = se2.IDENTITY  # ours, which never jumps
+        self._topic, self._max_speed, self._max_turn = topic, max_speed, max_turn
+        self._pose: Floats = se2.IDENTITY  # without jumps
         self._last: OdometrySample | None = None
         self._received_ns: int | None = None  # arrival of the last valid message
-        self._fault, self._fault_ns = "", 0  # the newest, and its last time
+        self._fault, self._fault_ns = "", 0  # the newest fault, and its newest time
 
     @property
     def pose(self) -> Pose:
@@ -60,11 +60,11 @@ class OdometryWatch:
         self._fault, self._fault_ns = f"{self._topic}: {reason}", now_ns
 
     def restart(self) -> None:
-        """Forget the last arrival, because the transport is a new one."""
+        """Forget the last arrival, because the transport is new."""
         self._received_ns = None
 
     def add(self, sample: OdometrySample, now_ns: int) -> None:
-        """Take a message."""
+        """Add a message."""
         values = (*sample.pose, *_speeds(sample.velocity))
         if not all(map(math.isfinite, values)):
             self.refuse(
@@ -77,7 +77,7 @@ class OdometryWatch:
         elif sample.stamp_ns == last.stamp_ns:
             self.refuse("its stamps stand still: the same message again", now_ns)
             return
-        elif sample.stamp_ns < last.stamp_ns - BACK_NS:
+        elif sample.stamp_ns < last.stamp_ns - MAX_BACK_NS:
             back = (last.stamp_ns - sample.stamp_ns) / 1e9
             self.refuse(
                 f"its stamps went back by {back:.3g} s: restarted, or two publishers?", now_ns
@@ -85,8 +85,8 @@ class OdometryWatch:
             self._last = sample  # accept odometry again from here
             return
         else:
-            self._go_on(last, sample, now_ns)
-            velocity = self._possible(last, sample)
+            self._continue_pose(last, sample, now_ns)
+            velocity = self._plausible_velocity(last, sample)
             self._last, self._received_ns, self.velocity = sample, now_ns, velocity
             return
         self._last, self._received_ns, self.velocity = sample, now_ns, sample.velocity
@@ -103,30 +103,30 @@ class OdometryWatch:
             return f"{self._topic}: no message for {age_ns / 1e6:.0f} ms"
         return ""
 
-    def _possible(self, last: OdometrySample, sample: OdometrySample) -> Velocity:
-        """Return the velocity; an impossible turn rate is replaced by that of the poses.
+    def _plausible_velocity(self, last: OdometrySample, sample: OdometrySample) -> Velocity:
+        """Return the velocity; an impossible turn rate is replaced by the one between the poses.
 
         A TurtleBot3 reports -125 rad/s when its heading passes half a turn.
         """
         velocity = sample.velocity
-        if abs(velocity.angular_z) <= MAX_FACTOR * self._turn:
+        if abs(velocity.angular_z) <= MAX_RATE_FACTOR * self._max_turn:
             return velocity
         passed_s = max(sample.stamp_ns - last.stamp_ns, 1) / 1e9
         turned = float(se2.between(last.pose, sample.pose)[2])
         return structs.replace(velocity, angular_z=turned / passed_s)
 
-    def _go_on(self, last: OdometrySample, sample: OdometrySample, now_ns: int) -> None:
+    def _continue_pose(self, last: OdometrySample, sample: OdometrySample, now_ns: int) -> None:
         moved = se2.between(last.pose, sample.pose)
         passed_s = max(sample.stamp_ns - last.stamp_ns, 0) / 1e9
-        if self._received_ns is not None:  # stamps may jump ahead, arrivals do not
+        if self._received_ns is not None:  # stamps may jump ahead, arrival times cannot
             passed_s = min(passed_s, max((now_ns - self._received_ns) / 1e9, 0.0) + 0.5)
-        far, turned = math.hypot(moved[0], moved[1]), abs(float(moved[2]))
+        distance, turned = math.hypot(moved[0], moved[1]), abs(float(moved[2]))
         if (
-            far > PUSHED_FACTOR * self._speed * passed_s + JUMP_M
-            or turned > PUSHED_FACTOR * self._turn * passed_s + JUMP_RAD
+            distance > PUSHED_FACTOR * self._max_speed * passed_s + JUMP_M
+            or turned > PUSHED_FACTOR * self._max_turn * passed_s + JUMP_RAD
         ):
             self.refuse(
-                f"it jumped by {far:.2f} m and {math.degrees(turned):.0f} degrees in "
+                f"it jumped by {distance:.2f} m and {math.degrees(turned):.0f} degrees in "
                 f"{passed_s * 1e3:.0f} ms: was the robot restarted, or its odometry reset?",
                 now_ns,
             )
