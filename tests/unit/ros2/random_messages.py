@@ -1,4 +1,4 @@
-"""Messages of any type with random values, as JSON's values with bytes as lists."""
+"""Random messages of any type, as JSON values with bytes as lists."""
 
 import random
 import struct
@@ -20,7 +20,7 @@ RANGES = {
     "uint32": (0, 2**32 - 1),
     "int64": (-(2**63), 2**63 - 1),
     "uint64": (0, 2**64 - 1),
-    "byte": (0, 127),  # read with a sign here, and without one by ROS
+    "byte": (0, 127),  # signed here, unsigned in ROS
 }
 TEXTS = ("", "map", "ä€ 😀", "x" * 17)
 
@@ -46,10 +46,10 @@ def _value(types: Types, kind: Any, source: random.Random, texts: Sequence[str])
     return [_value(types, inner, source, texts) for _ in range(count)]
 
 
-def _scalar(primitive: str, longest: int, source: random.Random, texts: Sequence[str]) -> Any:
+def _scalar(primitive: str, max_length: int, source: random.Random, texts: Sequence[str]) -> Any:
     if primitive == "string":
         text = source.choice(texts)
-        return text[:longest] if longest and text.isascii() else "" if longest else text
+        return text[:max_length] if max_length and text.isascii() else "" if max_length else text
     if primitive == "bool":
         return source.random() < 0.5
     if primitive == "float64":

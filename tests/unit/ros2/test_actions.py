@@ -1,4 +1,4 @@
-"""An action's server: goals, results, cancelling, preemption, over nodes in memory."""
+"""An action server on a network in memory: goals, results, cancelling and preemption."""
 
 import asyncio
 from collections.abc import AsyncIterator, Callable
@@ -31,7 +31,7 @@ S = GoalState
 
 
 class Walk:
-    """Runs until it is told how to end."""
+    """A handler whose goals run until the test sets their outcome."""
 
     def __init__(self) -> None:
         self.accepts = self.cancels = True
@@ -51,7 +51,7 @@ class Walk:
 
 
 class Client:
-    """Asks as an action client of ROS does."""
+    """Sends requests as an action client of ROS does."""
 
     def __init__(self, node: MemoryTransport, types: Types) -> None:
         self.node, self.types = node, types
@@ -97,23 +97,23 @@ class World:
         self.client = Client(self.network.transport(Ros2Link(node="rviz")), types)
 
     def statuses(self) -> list[int]:
-        """Return what a late reader of the status topic gets."""
-        got: list[list[int]] = []
+        """Return the states that a late reader of the status topic receives."""
+        received_lists: list[list[int]] = []
         self.client.node.subscribe(
             "/navigate_to_pose/_action/status",
             STATUS_TYPE,
             ACTION_STATUS,
-            lambda received: got.append(
+            lambda received: received_lists.append(
                 [
                     each.status
                     for each in self.types.decode(STATUS_TYPE, received.payload).status_list
                 ]
             ),
         )()
-        return got[-1]
+        return received_lists[-1]
 
-    async def tells(self, states: list[int]) -> None:
-        """Wait for these statuses: they are told a little later."""
+    async def wait_for_states(self, states: list[int]) -> None:
+        """Wait for these states, which are published a little later."""
         await until(lambda: self.statuses() == states, f"{states} on the status topic")
 
 
@@ -127,25 +127,25 @@ def types() -> Types:
 
 @pytest.fixture
 async def world(types: Types) -> AsyncIterator[World]:
-    made = World(types)
-    yield made
-    await made.server.close()
+    world = World(types)
+    yield world
+    await world.server.close()
 
 
 @pytest.mark.long
 async def test_a_goal_is_followed_to_its_result(world: World) -> None:
-    heard: list[Any] = []
+    feedback: list[Any] = []
     kind = f"{NAVIGATE}_FeedbackMessage"
     world.client.node.subscribe(
         "/navigate_to_pose/_action/feedback",
         kind,
         DEFAULT,
-        lambda received: heard.append(world.types.decode(kind, received.payload)),
+        lambda received: feedback.append(world.types.decode(kind, received.payload)),
     )
-    await world.tells([])
+    await world.wait_for_states([])
     assert await world.client.send(A, behavior_tree="here")
     await settle()
-    await world.tells([S.EXECUTING])
+    await world.wait_for_states([S.EXECUTING])
     waiting = asyncio.create_task(world.client.result(A))
     await settle()
     world.walk.feedback({"distance_remaining": 1.5})
@@ -153,11 +153,11 @@ async def test_a_goal_is_followed_to_its_result(world: World) -> None:
     world.walk.running[A].set_result(Outcome(S.SUCCEEDED, {"error_code": 7}))
     assert await waiting == (S.SUCCEEDED, 7)
     assert await world.client.result(A) == (S.SUCCEEDED, 7)
-    await world.tells([S.SUCCEEDED])
-    assert (heard[0].goal_id.uuid.tobytes(), heard[0].feedback.distance_remaining) == (A, 1.5)
+    await world.wait_for_states([S.SUCCEEDED])
+    assert (feedback[0].goal_id.uuid.tobytes(), feedback[0].feedback.distance_remaining) == (A, 1.5)
 
 
-async def test_a_goal_is_rejected_by_the_handler_and_a_second_time(world: World) -> None:
+async def test_a_goal_is_rejected_by_the_handler_or_if_its_id_is_known(world: World) -> None:
     world.walk.accepts = False
     assert not await world.client.send(A)
     world.walk.accepts = True
@@ -176,21 +176,21 @@ async def test_cancelling_asks_the_handler_and_ends_as_canceled(world: World) ->
     world.walk.cancels = True
     assert await world.client.cancel(A) == (CancelCode.NONE, [A])
     await settle()
-    await world.tells([S.CANCELING])
+    await world.wait_for_states([S.CANCELING])
     world.walk.running[A].set_result(Outcome(S.CANCELED))
     assert await world.client.result(A) == (S.CANCELED, 0)
     assert await world.client.cancel(A) == (CancelCode.GOAL_TERMINATED, [])
     assert await world.client.cancel(B) == (CancelCode.UNKNOWN_GOAL, [])
 
 
-async def test_zero_id_and_time_cancel_all_and_none_is_no_error(world: World) -> None:
+async def test_a_zero_id_and_time_cancel_all_goals_even_if_there_are_none(world: World) -> None:
     assert await world.client.cancel() == (CancelCode.NONE, [])
     await world.client.send(A)
     await world.client.send(B)
     assert await world.client.cancel() == (CancelCode.NONE, [A, B])
 
 
-async def test_a_time_cancels_what_was_accepted_until_then(world: World) -> None:
+async def test_a_time_cancels_the_goals_accepted_up_to_it(world: World) -> None:
     await world.client.send(A)
     world.now_ns = 5 * 10**9
     await world.client.send(B)
@@ -208,23 +208,23 @@ async def test_a_new_goal_preempts_the_running_one(world: World) -> None:
     await settle()
     world.walk.running[A].set_result(Outcome(S.ABORTED))
     assert await world.client.result(A) == (S.ABORTED, 0)
-    await world.tells([S.ABORTED, S.EXECUTING])
+    await world.wait_for_states([S.ABORTED, S.EXECUTING])
 
 
-async def test_the_states_of_many_goals_are_reported_a_few_times(world: World) -> None:
-    told: list[int] = []
+async def test_the_states_of_many_goals_are_published_together(world: World) -> None:
+    lengths: list[int] = []
     loop = asyncio.get_running_loop()
     world.client.node.subscribe(
         "/navigate_to_pose/_action/status",
         STATUS_TYPE,
         ACTION_STATUS,
-        lambda got: told.append(len(world.types.decode(STATUS_TYPE, got.payload).status_list)),
+        lambda got: lengths.append(len(world.types.decode(STATUS_TYPE, got.payload).status_list)),
     )
     began_s = loop.time()
     for number in range(30):
         await world.client.send(number.to_bytes(16, "big"))
-    await until(lambda: told[-1] == 30, "all goals on the status topic")
-    assert len(told) <= 3 + (loop.time() - began_s) / STATUS_INTERVAL_S
+    await until(lambda: lengths[-1] == 30, "all goals on the status topic")
+    assert len(lengths) <= 3 + (loop.time() - began_s) / STATUS_INTERVAL_S
 
 
 async def test_a_large_request_is_not_decoded(world: World) -> None:
@@ -233,14 +233,14 @@ async def test_a_large_request_is_not_decoded(world: World) -> None:
         await world.client.send(B, behavior_tree="x" * 70_000)
 
 
-async def test_a_fault_of_the_handler_aborts(world: World) -> None:
+async def test_an_error_of_the_handler_aborts_the_goal(world: World) -> None:
     await world.client.send(A)
     await settle()
     world.walk.running[A].set_exception(Refused("no map"))
     assert await world.client.result(A) == (S.ABORTED, 0)
 
 
-async def test_closing_aborts_and_answers_no_more(world: World) -> None:
+async def test_closing_aborts_goals_and_ends_the_services(world: World) -> None:
     await world.client.send(A)
     await settle()
     waiting = asyncio.create_task(world.client.result(A))
@@ -266,7 +266,7 @@ async def test_a_malformed_request_gets_no_answer(world: World) -> None:
         )
 
 
-def test_results_are_kept_for_a_time_and_bounded() -> None:
+def test_a_result_is_forgotten_after_its_lifetime() -> None:
     goals = Goals()
     first = goals.accept(A, None, 0)
     goals.end(first, Outcome(S.SUCCEEDED), 0)
@@ -276,7 +276,7 @@ def test_results_are_kept_for_a_time_and_bounded() -> None:
     assert goals.get(A) is None
 
 
-def test_active_goals_are_bounded() -> None:
+def test_the_number_of_active_goals_is_limited() -> None:
     goals = Goals()
     for number in range(MAX_ACTIVE):
         assert goals.may_accept(bytes([number]))

@@ -1,4 +1,4 @@
-"""The board and the lidar of the TurtleBot3 that judges us, in a world of walls."""
+"""Board and lidar of the simulated TurtleBot3 in `tests/ros2/programs`."""
 
 import math
 
@@ -11,10 +11,10 @@ ROOM = np.array([[-2, -1, 2, -1], [2, -1, 2, 1], [2, 1, -2, 1], [-2, 1, -2, -1]]
 NO_WALLS = np.empty((0, 4))
 
 
-def driven(board: Board, seconds: float, begin_s: float = 0.0, beats: bool = True) -> Board:
+def driven(board: Board, seconds: float, start_s: float = 0.0, heartbeats: bool = True) -> Board:
     for tick in range(round(seconds / 0.01)):
-        now_s = begin_s + tick * 0.01
-        if beats:
+        now_s = start_s + tick * 0.01
+        if heartbeats:
             board.beat(now_s)
         board.step(now_s, 0.01)
     return board
@@ -34,20 +34,20 @@ def test_clearance_is_to_the_nearest_point_of_a_wall() -> None:
     assert clearance(NO_WALLS, 0.0, 0.0) == math.inf
 
 
-def test_a_command_is_kept_while_the_heart_beats_and_500_ms_more() -> None:
+def test_a_command_is_kept_until_500_ms_after_the_last_heartbeat() -> None:
     board = Board(NO_WALLS, (0.0, 0.0, 0.0))
     board.command((20, 0))
-    driven(board, 3.0)  # 10 cm/s of it gained in each 50 ms
+    driven(board, 3.0)  # it gains 10 cm/s in each 50 ms
     assert board.x_m == pytest.approx(0.2 * 3.0 - 0.01, abs=2e-3)
     before = board.x_m
-    driven(board, 2.0, begin_s=3.0, beats=False)
+    driven(board, 2.0, start_s=3.0, heartbeats=False)
     assert board.x_m - before == pytest.approx(0.2 * 0.5 + 0.01, abs=4e-3)
     assert board.speed_mps == 0.0
-    driven(board, 1.0, begin_s=5.0)  # the heart beats again, but the command is forgotten
+    driven(board, 1.0, start_s=5.0)  # heartbeats return, but the command is forgotten
     assert board.speed_mps == 0.0
 
 
-def test_commands_are_bounded_as_the_firmware_does() -> None:
+def test_commands_are_limited_as_in_the_firmware() -> None:
     board = Board(NO_WALLS, (0.0, 0.0, 0.0))
     board.command((100, -900))
     driven(board, 1.0)
@@ -62,7 +62,7 @@ def test_wheels_slip_at_a_wall_and_a_contact_counts_once() -> None:
     assert board.contacts == 1
     assert board.wheels_rad[0] == pytest.approx((2.0 - 0.01) / 0.033, rel=0.01)
     board.command((-20, 0))
-    driven(board, 1.0, begin_s=10.0)
+    driven(board, 1.0, start_s=10.0)
     assert board.x_m < 0.25
     assert board.contacts == 1
 

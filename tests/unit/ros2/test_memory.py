@@ -1,4 +1,4 @@
-"""The network in memory matches and delivers as DDS does."""
+"""The network in memory matches endpoints and delivers messages as DDS does."""
 
 import pytest
 
@@ -27,25 +27,25 @@ def test_a_message_reaches_readers_of_other_nodes_only(
     network: MemoryNetwork, types: Types
 ) -> None:
     ours, theirs = network.transport(), network.transport(Ros2Link(node="rviz"))
-    got: list[Received] = []
+    received: list[Received] = []
     own: list[Received] = []
-    theirs.subscribe("/chat", STRING, Qos(), got.append)
+    theirs.subscribe("/chat", STRING, Qos(), received.append)
     ours.subscribe("/chat", STRING, Qos(), own.append)
     ours.publisher("chat", STRING).publish(types.encode(STRING, types.make(STRING, data="hi")))
-    assert [types.decode(STRING, each.payload).data for each in got] == ["hi"]
-    assert got[0].source_ns == 5
+    assert [types.decode(STRING, each.payload).data for each in received] == ["hi"]
+    assert received[0].source_ns == 5
     assert own == []
 
 
-def test_readers_are_told_as_they_come_and_go(network: MemoryNetwork) -> None:
-    told: list[int] = []
-    publisher = network.transport().publisher("/chat", STRING, on_readers=told.append)
+def test_each_change_of_the_number_of_readers_is_reported(network: MemoryNetwork) -> None:
+    counts: list[int] = []
+    publisher = network.transport().publisher("/chat", STRING, on_readers=counts.append)
     reader = network.transport(Ros2Link(node="rviz"))
     close = reader.subscribe("/chat", STRING, Qos(), lambda _: None)
     assert publisher.readers == 1
     close()
     close()
-    assert (publisher.readers, told) == (0, [1, 0])
+    assert (publisher.readers, counts) == (0, [1, 0])
 
 
 def test_a_reliable_reader_does_not_match_a_best_effort_publisher(network: MemoryNetwork) -> None:
@@ -54,7 +54,7 @@ def test_a_reliable_reader_does_not_match_a_best_effort_publisher(network: Memor
     assert publisher.readers == 0
 
 
-def test_a_late_reader_gets_the_last_of_a_latched_topic(network: MemoryNetwork) -> None:
+def test_a_late_reader_receives_the_last_message_of_a_latched_topic(network: MemoryNetwork) -> None:
     publisher = network.transport().publisher("/map", STRING, LATCHED)
     publisher.publish(b"1")
     publisher.publish(b"2")
@@ -65,7 +65,7 @@ def test_a_late_reader_gets_the_last_of_a_latched_topic(network: MemoryNetwork) 
     assert ([each.payload for each in late], volatile) == ([b"2"], [])
 
 
-async def test_a_call_gets_the_answer_of_its_service(network: MemoryNetwork) -> None:
+async def test_a_call_returns_the_response_of_its_service(network: MemoryNetwork) -> None:
     async def answer(request: bytes) -> bytes:
         if request == b"no":
             raise Refused("no")
@@ -92,6 +92,6 @@ def test_the_graph_names_nodes_and_endpoints(network: MemoryNetwork) -> None:
 
 
 @pytest.mark.parametrize("topic", ["", "/", "a b", "a//b", "1a", "/a/"])
-def test_a_topic_with_an_impossible_name_is_refused(network: MemoryNetwork, topic: str) -> None:
+def test_a_topic_with_an_invalid_name_is_rejected(network: MemoryNetwork, topic: str) -> None:
     with pytest.raises(ConfigError):
         network.transport().publisher(topic, STRING)

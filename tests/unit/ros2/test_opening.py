@@ -1,4 +1,4 @@
-"""Opening a transport: what is missing is named."""
+"""Opening a transport: errors name what is missing, and nothing is left open."""
 
 import socket
 from pathlib import Path
@@ -37,7 +37,7 @@ async def test_a_domain_that_cannot_be_joined_leaves_no_file_open(types: Types) 
     with socket.socket(type=socket.SOCK_DGRAM) as taken:
         taken.bind(("", multicast_port(230)))
         link, files = Ros2Link(transport="dds", domain=230), []
-        for _ in range(3):  # as a driver does five times a second
+        for _ in range(3):  # a driver tries it five times a second
             with pytest.raises(BusError, match="UDP port 64900 of DDS domain 230"):
                 async with open_transport(link, types):
                     pass
@@ -53,14 +53,14 @@ async def test_rmw_zenoh_without_a_router_names_the_option(types: Types) -> None
 
 def test_the_deployments_own_router_is_used_outside_the_robots_namespace(types: Types) -> None:
     own = Endpoint(connect=("tcp/127.0.0.1:7447",), namespace="robot1", keys="", nap_s=0.1)
-    made = RmwZenohTransport(Ros2Link(), types, own)
-    assert made.endpoint == Endpoint(connect=("tcp/127.0.0.1:7447",), stamps=True)
+    default = RmwZenohTransport(Ros2Link(), types, own)
+    assert default.endpoint == Endpoint(connect=("tcp/127.0.0.1:7447",), stamps=True)
     other = RmwZenohTransport(Ros2Link(router="tcp/10.0.0.2:7447"), types, own)
     assert other.endpoint.connect == ("tcp/10.0.0.2:7447",)
 
 
 @pytest.mark.long
-def test_types_of_ones_own_are_loaded(tmp_path: Path) -> None:
+def test_types_of_the_user_are_loaded(tmp_path: Path) -> None:
     (tmp_path / "msg").mkdir()
     (tmp_path / "msg/Thing.msg").write_text("int32 a\n")
     link = Ros2Link(types=(str(tmp_path),))
@@ -83,6 +83,6 @@ def test_a_mismatch_of_qos_is_named(offered: Qos, requested: Qos, words: str) ->
 
 
 @pytest.mark.parametrize("depth", [0, 1001])
-def test_a_depth_has_bounds(depth: int) -> None:
+def test_a_depth_out_of_range_is_rejected(depth: int) -> None:
     with pytest.raises(ValueError, match="1 to 1000"):
         Qos(depth=depth)

@@ -1,4 +1,4 @@
-"""Keys, tokens and attachments of rmw_zenoh, by the values that its sources give."""
+"""Keys, tokens and attachments of rmw_zenoh, compared with values from its source code."""
 
 import struct
 
@@ -32,7 +32,7 @@ def test_a_topics_key_has_domain_name_type_and_hash() -> None:
     assert key == f"3/robot1/chatter/std_msgs::msg::dds_::String_/{HASH}"
 
 
-def test_a_publishers_token_is_that_of_the_talker() -> None:
+def test_a_publishers_token_equals_that_of_the_ros_talker() -> None:
     token = NODE.endpoint_token(
         1, "publisher", "/chatter", "std_msgs/msg/String", HASH, Qos(depth=7)
     )
@@ -46,14 +46,14 @@ def test_a_node_in_a_namespace_has_its_slashes_replaced() -> None:
     assert parse_token(node.token, "") == "/fleet/robot1/gigabrain"
 
 
-def test_a_token_is_read_as_it_was_made() -> None:
+def test_a_token_is_parsed_into_its_endpoint() -> None:
     endpoint = parse_token(TOKEN, "ab")
     assert endpoint == GraphEndpoint(
         "/talker", "publisher", "/chatter", "std_msgs/msg/String", HASH, Qos(depth=7), False
     )
 
 
-def test_humbles_token_has_no_hash() -> None:
+def test_a_token_of_humble_has_no_hash() -> None:
     endpoint = parse_token(TOKEN.replace(HASH, "TypeHashNotSupported"), NODE.zid)
     assert isinstance(endpoint, GraphEndpoint)
     assert (endpoint.hash, endpoint.ours) == ("", True)
@@ -68,12 +68,12 @@ def test_humbles_token_has_no_hash() -> None:
         (Qos(transient_local=True, depth=1), ":1:,1:,:,:,,"),
     ],
 )
-def test_qos_leaves_out_what_is_the_default(qos: Qos, text: str) -> None:
+def test_the_qos_text_omits_default_values(qos: Qos, text: str) -> None:
     assert qos_text(qos) == text
     assert parse_qos(text) == qos
 
 
-def test_qos_of_others_is_read_within_bounds() -> None:
+def test_the_depth_of_a_parsed_qos_is_limited() -> None:
     assert parse_qos("1:2:2,0:1,2:,:,,") == Qos(depth=1)
     assert parse_qos("::,99999999:,:,:,,").depth == 1000
 
@@ -91,18 +91,18 @@ def test_qos_of_others_is_read_within_bounds() -> None:
         "@ros2_lv/0/ab/0/1/MP/%/%/talker/%chatter",
     ],
 )
-def test_what_is_no_token_is_refused(key: str) -> None:
+def test_a_malformed_token_is_rejected(key: str) -> None:
     with pytest.raises(ValueError, match=r"token|QoS|invalid literal"):
         parse_token(key, "")
 
 
-def test_an_attachment_is_33_bytes_as_the_sources_have_it() -> None:
+def test_an_attachment_has_the_33_bytes_of_the_source_code() -> None:
     data = Attachment(1, 1_700_000_000_000_000_000, GID).to_bytes()
     assert data.hex() == "010000000000000000002a36fe9c971710" + GID.hex()
     assert parse_attachment(data) == Attachment(1, 1_700_000_000_000_000_000, GID)
 
 
-def test_the_named_form_of_77_bytes_is_read_and_answered_in_kind() -> None:
+def test_the_long_form_of_77_bytes_is_parsed_and_answered_in_the_same_form() -> None:
     data = (
         b"\x0fsequence_number"
         + struct.pack("<q", 9)
@@ -111,19 +111,19 @@ def test_the_named_form_of_77_bytes_is_read_and_answered_in_kind() -> None:
         + b"\x0asource_gid\x10"
         + GID
     )
-    known = parse_attachment(data)
-    assert (len(data), known) == (77, Attachment(9, 17, GID, named=True))
-    answered = known.answered().to_bytes()
+    attachment = parse_attachment(data)
+    assert (len(data), attachment) == (77, Attachment(9, 17, GID, named=True))
+    answered = attachment.answered().to_bytes()
     assert (len(answered), answered[:24], answered[49:]) == (77, data[:24], data[49:])
 
 
 @pytest.mark.parametrize("data", [b"", bytes(33), bytes(32), bytes(77), bytes(1000)])
-def test_another_attachment_is_refused(data: bytes) -> None:
+def test_a_malformed_attachment_is_rejected(data: bytes) -> None:
     with pytest.raises(ValueError, match="expected 33 or 77"):
         parse_attachment(data)
 
 
 @pytest.mark.parametrize("type", ["String", "std_msgs/String", "std_msgs/msg/a b", "../msg/X", ""])
-def test_a_type_with_an_impossible_name_is_refused(type: str) -> None:
+def test_a_type_with_an_invalid_name_is_rejected(type: str) -> None:
     with pytest.raises(ConfigError, match="std_msgs/msg/String"):
         topic_key(0, "/a", type, HASH)

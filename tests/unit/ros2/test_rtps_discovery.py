@@ -1,4 +1,4 @@
-"""Discovery data of participants and endpoints, compared with those of Fast DDS 2.14.5."""
+"""Discovery data of participants and endpoints, compared with bytes of Fast DDS 2.14.5."""
 
 import pytest
 
@@ -16,7 +16,7 @@ from gigabrain_zenoh.ros2.rtps_discovery import (
 from gigabrain_zenoh.ros2.rtps_wire import BadMessage
 
 PREFIX = bytes.fromhex("010f78fd2e2c130400000000")
-FAST_DDS_PARTICIPANT = bytes.fromhex(  # its host has the address 192.0.2.2
+FAST_DDS_PARTICIPANT = bytes.fromhex(  # on a host with the address 192.0.2.2
     "0003000015000400020200001600040001 0f000050001000010f78fd2e2c1304000000000000"
     "01c107800400010000003200180001000000246800000000000000000000000000"
     "00c00002023100180001000000256800000000000000000000"
@@ -38,7 +38,7 @@ FAST_DDS_READER = bytes.fromhex(
 )
 
 
-def test_a_participant_of_fast_dds_is_read():
+def test_a_participant_of_fast_dds_is_decoded():
     data = decode_participant(FAST_DDS_PARTICIPANT, bytes.fromhex("010f"))
 
     assert data.prefix == PREFIX
@@ -47,7 +47,7 @@ def test_a_participant_of_fast_dds_is_read():
     assert (data.lease_s, data.endpoints) == (20.0, 0xC3F)
 
 
-def test_an_endpoint_of_fast_dds_is_read():
+def test_an_endpoint_of_fast_dds_is_decoded():
     assert decode_endpoint(FAST_DDS_READER) == EndpointData(
         guid=PREFIX + bytes.fromhex("00001304"),
         topic="rq/estopRequest",
@@ -56,7 +56,7 @@ def test_an_endpoint_of_fast_dds_is_read():
     )
 
 
-def test_our_participant_announces_its_enclave_as_ros_does():
+def test_our_participant_announces_its_enclave_as_in_ros():
     data = ParticipantData(PREFIX, (("10.0.0.1", 7410),), (("10.0.0.1", 7411),))
 
     payload = data.encode()
@@ -66,7 +66,7 @@ def test_our_participant_announces_its_enclave_as_ros_does():
     assert decode_participant(payload, bytes(2)) == data
 
 
-def test_our_endpoint_announces_its_type_hash_as_ros_does():
+def test_our_endpoint_announces_its_type_hash_as_in_ros():
     data = EndpointData(PREFIX + b"\0\0\1\4", "rq/aRequest", "a::srv::dds_::B_Request_")
 
     payload = data._replace(type_hash="RIHS01_00").encode()
@@ -75,7 +75,7 @@ def test_our_endpoint_announces_its_type_hash_as_ros_does():
     assert decode_endpoint(payload) == data
 
 
-def test_keys_name_what_is_gone():
+def test_a_key_names_the_participant_or_endpoint_that_ended():
     participant = ParticipantData(PREFIX, (), ())
     endpoint = EndpointData(PREFIX + b"\0\0\1\3", "a", "b")
 
@@ -89,7 +89,7 @@ def test_ports_are_those_of_the_specification():
     assert participant_ports(42, 3) == (17916, 17917)
 
 
-def test_services_have_the_names_that_ros_gives_them():
+def test_services_have_the_dds_names_of_ros():
     assert service_topics("/robot1/estop") == ("rq/robot1/estopRequest", "rr/robot1/estopReply")
     assert service_types("std_srvs/srv/SetBool") == (
         "std_srvs::srv::dds_::SetBool_Request_",
@@ -108,19 +108,19 @@ def test_services_have_the_names_that_ros_gives_them():
         ({"topic": "rq/bRequest"}, False),
         ({"type": "other"}, False),
         ({"reliable": False}, False),  # a best-effort writer for a reliable reader
-        ({"durability": 1}, True),  # a writer may offer more than is asked
+        ({"durability": 1}, True),  # a writer may offer more than is requested
         ({"partitioned": True}, False),
         ({"guid": PREFIX + b"\0\0\1\4"}, False),  # two readers
     ],
 )
-def test_a_writer_matches_what_its_qos_satisfies(change, matched):
+def test_a_writer_matches_readers_whose_qos_it_satisfies(change, matched):
     reader = EndpointData(PREFIX + b"\0\0\1\4", "rq/aRequest", "T")
     writer = EndpointData(PREFIX + b"\0\0\2\3", "rq/aRequest", "T")._replace(**change)
 
     assert reader.matches(writer) is writer.matches(reader) is matched
 
 
-def test_a_reader_that_wants_old_samples_does_not_match_a_volatile_writer():
+def test_a_transient_local_reader_does_not_match_a_volatile_writer():
     writer = EndpointData(PREFIX + b"\0\0\2\3", "a", "T")
 
     assert not writer.matches(EndpointData(PREFIX + b"\0\0\1\4", "a", "T", durability=1))
@@ -137,7 +137,7 @@ def test_data_go_only_to_the_host_that_announced_them():
 
 
 @pytest.mark.parametrize("address", ["00000000", "efff0001", "ffffffff"])
-def test_addresses_of_many_or_of_none_are_not_used(address):
+def test_multicast_and_zero_addresses_are_not_used(address):
     locator = bytes.fromhex("3200180001000000f21c0000000000000000000000000000" + address)
     payload = FAST_DDS_PARTICIPANT[:-4] + locator + FAST_DDS_PARTICIPANT[-4:]
 
@@ -154,6 +154,6 @@ def test_addresses_of_many_or_of_none_are_not_used(address):
         FAST_DDS_READER.replace(b"\x10\0\0\0rq", b"\xff\0\0\0rq"),  # a name beyond its parameter
     ],
 )
-def test_payloads_that_are_no_discovery_data_are_refused(payload):
+def test_malformed_discovery_data_are_rejected(payload):
     with pytest.raises(BadMessage):
         decode_endpoint(payload)

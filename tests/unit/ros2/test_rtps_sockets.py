@@ -1,4 +1,4 @@
-"""The ports of a participant, in the last domain, which has ports for 63 of them only."""
+"""Ports and addresses of a participant. The last domain has ports for only 63 participants."""
 
 import contextlib
 import errno
@@ -16,7 +16,7 @@ from gigabrain_zenoh.ros2.rtps_discovery import (
 from gigabrain_zenoh.ros2.rtps_sockets import Sockets, outer_addresses
 
 
-async def test_the_last_domain_is_announced_to_the_ports_that_it_has():
+async def test_announcements_in_the_last_domain_use_only_valid_ports():
     sockets = Sockets(MAX_DOMAIN, localhost=True, peers=["127.0.0.2"])
     await sockets.open(lambda datagram, host: None)
     with contextlib.closing(sockets):
@@ -24,7 +24,7 @@ async def test_the_last_domain_is_announced_to_the_ports_that_it_has():
         sockets.announce(b"RTPS")
 
 
-async def test_the_last_domain_says_which_of_its_ports_are_all_taken():
+async def test_an_error_names_the_ports_of_a_domain_without_free_ones():
     with contextlib.ExitStack() as others:
         for index in range(63):
             for port in participant_ports(MAX_DOMAIN, index):
@@ -36,7 +36,7 @@ async def test_the_last_domain_says_which_of_its_ports_are_all_taken():
             await sockets.open(lambda datagram, host: None)
 
 
-async def test_a_port_of_announcements_that_another_program_has_is_named():
+async def test_an_error_names_an_occupied_multicast_port():
     domain = 231
     with socket.socket(type=socket.SOCK_DGRAM) as taken:
         taken.bind(("", multicast_port(domain)))
@@ -49,7 +49,7 @@ async def test_a_port_of_announcements_that_another_program_has_is_named():
             free.bind(("", port))
 
 
-async def test_addresses_that_cannot_be_read_leave_those_before(monkeypatch):
+async def test_the_known_addresses_are_kept_while_none_can_be_read(monkeypatch):
     sockets = Sockets(MAX_DOMAIN, localhost=False, peers=())
     before = sockets.refresh()
 

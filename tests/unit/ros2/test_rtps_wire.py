@@ -1,4 +1,4 @@
-"""Messages of RTPS, compared with literal bytes: of the specification, and sent by Fast DDS 2.14.5.
+"""RTPS messages, compared with bytes from the specification and from Fast DDS 2.14.5.
 
 The latter were captured between an rclpy client and server of ROS 2 Jazzy.
 """
@@ -50,7 +50,7 @@ FAST_DDS_ACKNACK = bytes.fromhex(
 )
 
 
-def test_a_request_of_fast_dds_names_the_reader_that_waits_for_its_reply():
+def test_a_request_of_fast_dds_names_the_reader_of_its_reply():
     message = decode_message(FAST_DDS_REQUEST, SERVER)
 
     assert (message.prefix, message.vendor) == (CLIENT, bytes.fromhex("010f"))
@@ -74,18 +74,18 @@ def test_a_reply_of_fast_dds_names_the_request():
     assert heartbeat == Heartbeat(READER, WRITER, first=9, last=18, serial=3)
 
 
-def test_what_is_for_another_participant_is_left_out():
+def test_submessages_for_another_participant_are_skipped():
     assert decode_message(FAST_DDS_REQUEST, CLIENT).submessages == []
 
 
-def test_fast_dds_asks_for_samples_by_a_bitmap():
+def test_fast_dds_requests_samples_by_a_bitmap():
     (ack,) = decode_message(FAST_DDS_ACKNACK, CLIENT).submessages
 
     assert ack.missing == tuple(range(1, 10))
     assert (ack.base, ack.serial, ack.final) == (1, 6, False)
 
 
-def test_our_reply_has_the_identity_of_the_request_under_both_numbers():
+def test_our_reply_has_the_identity_of_the_request_in_both_parameters():
     reply = Data(READER, WRITER, 18, b"\0\1\0\0", Sample(CLIENT + READER, 18))
 
     datagram = encode_message(SERVER, CLIENT, [reply], 1_700_000_000_500_000_000)
@@ -122,7 +122,7 @@ def test_submessages_have_the_bytes_of_the_specification():
 
 
 @pytest.mark.parametrize(
-    "one",
+    "submessage",
     [
         Data(READER, WRITER, 1 << 40, b"\0\1\0\0abcd", Sample(CLIENT + READER, 1)),
         Data(READER, WRITER, 3, b"\0\3\0\0", None, DISPOSED, CLIENT + READER),
@@ -134,13 +134,13 @@ def test_submessages_have_the_bytes_of_the_specification():
         HeartbeatFragments(READER, WRITER, 1, 60, 3),
     ],
 )
-def test_a_submessage_is_read_as_it_was_written(one):
-    datagram = encode_message(SERVER, CLIENT, [one], 0)
+def test_a_submessage_is_decoded_as_it_was_encoded(submessage):
+    datagram = encode_message(SERVER, CLIENT, [submessage], 0)
 
-    assert decode_message(datagram, CLIENT).submessages == [one]
+    assert decode_message(datagram, CLIENT).submessages == [submessage]
 
 
-def test_big_endian_submessages_are_read():
+def test_big_endian_submessages_are_decoded():
     body = READER + WRITER + bytes.fromhex("0000000000000001 0000000000000002 00000005")
     datagram = b"RTPS\2\1\1\x10" + CLIENT + b"\7\0\0\x1c" + body
 
@@ -149,24 +149,28 @@ def test_big_endian_submessages_are_read():
     assert heartbeat == Heartbeat(READER, WRITER, 1, 2, 5)
 
 
-def test_the_last_submessage_may_leave_its_length_open():
+def test_the_last_submessage_may_omit_its_length():
     whole = encode_message(SERVER, b"", [Data(READER, WRITER, 1, b"\0\1\0\0" + bytes(8))], 0)
     at = whole.index(b"\x15\x05")
-    opened = whole[: at + 2] + b"\0\0" + whole[at + 4 :]
+    open_ended = whole[: at + 2] + b"\0\0" + whole[at + 4 :]
 
-    assert decode_message(opened, CLIENT).submessages == decode_message(whole, CLIENT).submessages
+    assert (
+        decode_message(open_ended, CLIENT).submessages == decode_message(whole, CLIENT).submessages
+    )
 
 
-def test_submessages_before_a_fault_count():
+def test_submessages_before_a_malformed_one_are_kept():
     good = Heartbeat(READER, WRITER, 1, 2, 1)
     datagram = encode_message(SERVER, b"", [good, good], 0)
-    wrong = datagram[:-20] + bytes.fromhex("ffffffff") + datagram[-16:]  # begins below 1
+    wrong = (
+        datagram[:-20] + bytes.fromhex("ffffffff") + datagram[-16:]
+    )  # its first sample is below 1
 
     assert decode_message(wrong, CLIENT).submessages == [good]
     assert decode_message(datagram[:-4], CLIENT).submessages == [good]
 
 
-def test_no_participant_speaks_for_another():
+def test_submessages_with_another_source_are_ignored():
     source = b"\x0c\1\x14\0" + bytes(4) + b"\2\3\0\0" + CLIENT
     datagram = encode_message(SERVER, b"", [Heartbeat(READER, WRITER, 1, 2, 1)], 0)
 
@@ -174,7 +178,7 @@ def test_no_participant_speaks_for_another():
 
 
 @pytest.mark.parametrize("header", [b"", b"RTPS", b"RTPX\2\3" + bytes(14), b"RTPS\3\0" + bytes(14)])
-def test_a_datagram_of_another_protocol_is_refused(header):
+def test_a_datagram_of_another_protocol_is_rejected(header):
     with pytest.raises(BadMessage):
         decode_message(header, CLIENT)
 
@@ -186,6 +190,6 @@ def test_parameters_are_padded_and_end_with_a_sentinel():
 
 
 @pytest.mark.parametrize("data", ["", "15000400", "1500040002030000", "15000c0002030000 01000000"])
-def test_a_list_of_parameters_that_ends_too_early_is_refused(data):
+def test_a_list_of_parameters_that_ends_early_is_rejected(data):
     with pytest.raises(BadMessage):
         list(decode_parameters("<", bytes.fromhex(data)))

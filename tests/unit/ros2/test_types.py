@@ -1,4 +1,4 @@
-"""Types: CDR as ROS writes it, values from and to JSON, definitions of one's own, nonsense."""
+"""Types: CDR as in ROS, conversion from and to JSON, the user's definitions, bad payloads."""
 
 import contextlib
 import json
@@ -83,7 +83,7 @@ def test_hashes_are_those_of_ros(types: Types, name: str) -> None:
     assert types.hash(name) == f"RIHS01_{HASHES[name]}"
 
 
-def test_left_out_fields_have_their_defaults(types: Types) -> None:
+def test_omitted_fields_have_their_defaults(types: Types) -> None:
     message = types.make(ODOMETRY, header={"frame_id": "odom"}, pose={"covariance": [1] * 36})
     assert message.pose.pose.orientation.w == 1.0
     assert message.header.frame_id == "odom"
@@ -98,7 +98,7 @@ def test_an_unknown_field_or_type_is_named(types: Types) -> None:
         types.make("std_msgs/msg/Heade")
 
 
-def test_values_go_through_json_and_back(types: Types) -> None:
+def test_a_message_is_the_same_after_conversion_to_json_and_back(types: Types) -> None:
     scan = types.make(SCAN, ranges=[1.0, math.inf, math.nan], angle_min=-math.inf)
     text = json.dumps(types.to_dict(scan), allow_nan=False)
     back = types.from_dict(SCAN, json.loads(text))
@@ -131,7 +131,9 @@ def test_bytes_are_base64_or_a_list(types: Types) -> None:
         ("geometry_msgs/msg/PoseWithCovariance", {"covariance": [0.0]}, "expected 36 elements"),
     ],
 )
-def test_values_that_do_not_fit_are_named(types: Types, name: str, data: Any, words: str) -> None:
+def test_an_error_names_the_field_of_a_wrong_value(
+    types: Types, name: str, data: Any, words: str
+) -> None:
     with pytest.raises(BadPayload, match=words):
         types.from_dict(name, data)
 
@@ -143,7 +145,7 @@ def write(folder: Path, name: str, text: str) -> Path:
     return folder
 
 
-def test_definitions_of_ones_own_are_read(tmp_path: Path) -> None:
+def test_definitions_of_the_user_are_read(tmp_path: Path) -> None:
     write(tmp_path, "my_msgs/msg/Thing.msg", "string<=5 name\nPart[<=2] parts\nfloat64 size 2.5")
     write(tmp_path, "my_msgs/msg/Part.msg", "uint8 KIND=3\nuint8 kind 3\nstd_msgs/Header header")
     write(tmp_path, "my_msgs/srv/Fetch.srv", "Thing thing\n---\nbool ok  # done\n")
@@ -198,7 +200,7 @@ def test_a_definition_may_begin_with_a_byte_order_mark(tmp_path: Path) -> None:
         ("my_msgs/msg/A.msg", "A[] x\n", "A.msg: .*my_msgs/msg/A contains itself"),
     ],
 )
-def test_definitions_that_cannot_be_used_are_named(
+def test_an_error_names_an_unusable_definition(
     tmp_path: Path, name: str, text: str, words: str
 ) -> None:
     with pytest.raises(ConfigError, match=words):
@@ -207,14 +209,14 @@ def test_definitions_that_cannot_be_used_are_named(
         Types([tmp_path / "missing.msg"])
 
 
-def test_types_that_contain_each_other_are_refused(tmp_path: Path) -> None:
+def test_types_that_contain_each_other_are_rejected(tmp_path: Path) -> None:
     write(tmp_path, "my_msgs/msg/A.msg", "B b\n")
     write(tmp_path, "my_msgs/msg/B.msg", "A[2] a\n")
     with pytest.raises(ConfigError, match=r"A\.msg: .*my_msgs/msg/A contains itself"):
         Types([tmp_path])
 
 
-def test_defaults_are_read_as_rosidl_reads_them(tmp_path: Path) -> None:
+def test_defaults_are_read_as_in_rosidl(tmp_path: Path) -> None:
     text = (
         "bool on 1\nfloat32 far inf\nfloat64 half 5e-1\nfloat64 one 1\nbyte high 255\n"
         "int8[] none []\nbool[2] both [1, false]\nstring[] names ['a', 'b']\nuint8[2] two [1, 2]\n"
@@ -232,7 +234,7 @@ def test_defaults_are_read_as_rosidl_reads_them(tmp_path: Path) -> None:
 
 
 @pytest.mark.long
-def test_every_type_is_read_as_it_was_written(types: Types) -> None:
+def test_every_type_is_decoded_as_it_was_encoded(types: Types) -> None:
     source = random.Random(1)
     for name in types.messages():
         message = types.from_dict(name, random_fields(types, name, source))
@@ -242,8 +244,8 @@ def test_every_type_is_read_as_it_was_written(types: Types) -> None:
 
 
 @pytest.mark.parametrize("name", USED)
-def test_tails_and_padding_of_real_ros_are_borne(types: Types, name: str) -> None:
-    """rclpy's serialize_message leaves both as they were in its memory."""
+def test_padding_and_bytes_after_a_message_are_ignored(types: Types, name: str) -> None:
+    """rclpy's serialize_message leaves random bytes in both."""
     message = types.from_dict(name, random_fields(types, name, random.Random(2)))
     payload, values = types.encode(name, message), types.to_dict(message)
 
@@ -264,7 +266,7 @@ def test_tails_and_padding_of_real_ros_are_borne(types: Types, name: str) -> Non
 
 
 def damaged(payload: bytes, source: random.Random) -> bytes:
-    """Return the payload with bits flipped, lengths changed, cut short, or with a tail."""
+    """Return the payload with flipped bits, changed lengths, missing or additional bytes."""
     body = bytearray(payload)
     for _ in range(source.randint(1, 4)):
         place = source.randrange(len(body) or 1)
@@ -292,8 +294,8 @@ def payloads(types: Types, source: random.Random) -> Iterator[tuple[str, bytes]]
         yield name, types.encode(name, message)
 
 
-def check(types: Types, name: str, payload: bytes) -> bool:
-    """Return whether a payload is read; what is read has values. Raises what is not expected."""
+def is_decoded(types: Types, name: str, payload: bytes) -> bool:
+    """Return whether a payload is decoded. Raises any error but BadPayload."""
     try:
         message = types.decode(name, payload)
     except BadPayload:
@@ -302,68 +304,68 @@ def check(types: Types, name: str, payload: bytes) -> bool:
     return True
 
 
-def storm(types: Types, rounds: int) -> tuple[int, int]:
-    """Decode damaged payloads of all types; return how many, and how many were read."""
-    source, tried, read = random.Random(3), 0, 0
+def decode_damaged(types: Types, rounds: int) -> tuple[int, int]:
+    """Decode damaged payloads of all types; return the numbers of tried and decoded ones."""
+    source, tried, decoded_count = random.Random(3), 0, 0
     for _ in range(rounds):
         for name, payload in payloads(types, source):
             for _ in range(10):
                 tried += 1
-                read += check(types, name, damaged(payload, source))
-    return tried, read
+                decoded_count += is_decoded(types, name, damaged(payload, source))
+    return tried, decoded_count
 
 
-def test_nonsense_raises_bad_payload_and_nothing_else(types: Types) -> None:
-    tried, read = storm(types, 1)
+def test_damaged_payloads_raise_only_bad_payload(types: Types) -> None:
+    tried, decoded_count = decode_damaged(types, 1)
     assert tried > 2000
-    assert 0 < read < tried
+    assert 0 < decoded_count < tried
 
 
 @pytest.mark.qa
-def test_a_million_payloads_of_nonsense_raise_nothing_else(types: Types) -> None:
+def test_a_million_damaged_payloads_raise_only_bad_payload(types: Types) -> None:
     rounds = 1_000_000 // (10 * len(types.messages())) + 1
-    assert storm(types, rounds)[0] >= 1_000_000
+    assert decode_damaged(types, rounds)[0] >= 1_000_000
 
 
-MAX_BYTES = 60  # of Python's objects, for each byte of a payload
-SIZE = 8000  # bytes
+MAX_ALLOCATED = 60  # bytes of Python's objects, for each byte of a payload
+PAYLOAD_BYTES = 8000
 
 
-def test_a_payload_allocates_no_more_than_its_length_allows(types: Types) -> None:
+def test_decoding_allocates_no_more_than_the_length_allows(types: Types) -> None:
     worst: dict[str, float] = {}
-    for name in types.messages():  # what is made for each type stays
+    for name in types.messages():  # decoders are generated at the first use, and kept
         with contextlib.suppress(BadPayload):
             types.decode(name, b"\0\1\0\0")
     tracemalloc.start()
     try:
         for name in types.messages():
-            for payload in hostile():
+            for payload in payloads_with_long_sequences():
                 tracemalloc.reset_peak()
                 before, _ = tracemalloc.get_traced_memory()
                 with contextlib.suppress(BadPayload):
                     types.decode(name, payload)
                 peak = tracemalloc.get_traced_memory()[1] - before
-                worst[name] = max(worst.get(name, 0.0), peak / SIZE)
+                worst[name] = max(worst.get(name, 0.0), peak / PAYLOAD_BYTES)
     finally:
         tracemalloc.stop()
-    assert {name: most for name, most in worst.items() if most > MAX_BYTES} == {}
+    assert {name: ratio for name, ratio in worst.items() if ratio > MAX_ALLOCATED} == {}
 
 
-def hostile() -> Iterator[bytes]:
-    """Yield payloads that claim a long sequence in their first fields."""
+def payloads_with_long_sequences() -> Iterator[bytes]:
+    """Yield payloads whose first fields are the length of a long sequence."""
     for fill in (b"\0", b"\1\0\0\0"):
         for start in range(0, 16, 4):
-            body = bytearray(fill * (SIZE // len(fill)))
-            body[start : start + 4] = (SIZE - 100).to_bytes(4, "little")
+            body = bytearray(fill * (PAYLOAD_BYTES // len(fill)))
+            body[start : start + 4] = (PAYLOAD_BYTES - 100).to_bytes(4, "little")
             yield b"\0\1\0\0" + bytes(body)
 
 
-def test_a_payload_beyond_the_limit_is_refused(types: Types) -> None:
+def test_a_payload_beyond_the_limit_is_rejected(types: Types) -> None:
     with pytest.raises(BadPayload, match="no CDR"):
         types.decode("sensor_msgs/msg/Image", b"\0\1\0\0" + bytes((64 << 20) + 1))
 
 
-def test_an_empty_message_has_a_byte_on_the_wire_and_none_in_json(types: Types) -> None:
+def test_an_empty_message_has_a_byte_on_the_wire_and_no_field_in_json(types: Types) -> None:
     name = "std_srvs/srv/Trigger_Request"
     payload = types.encode(name, types.make(name))
     assert payload.hex() == "0001000000"
