@@ -1,4 +1,4 @@
-"""An arm in memory with the gateway: the driver's process with its gate, and safety by hand."""
+"""An arm in memory with the gateway: the driver with its gate, and a stand-in for safety."""
 
 import asyncio
 import uuid
@@ -28,17 +28,17 @@ NAMES = ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_rol
 
 
 class MockArm(MockBody):
-    """Joints that follow 80 ms late, as servos do, unless they are blocked."""
+    """Joints that follow with a delay of 80 ms, as servos do, unless they are blocked."""
 
     def __init__(self, robot, options, run, mjcf=None):
         super().__init__(robot, options, run)
         self._mjcf = mjcf
-        self.blocked, self.let_go = False, False
-        self.places = self.targets = dict(zip(NAMES, robot.arm.home, strict=True))
-        self.history = []  # of the targets, one a call
+        self.blocked, self.is_limp = False, False
+        self.positions = self.targets = dict(zip(NAMES, robot.arm.home, strict=True))
+        self.history = []  # the targets of each call
 
     async def set_joint_positions(self, positions):
-        self.targets, self.let_go = self.targets | dict(positions), False
+        self.targets, self.is_limp = self.targets | dict(positions), False
         self.history.append(self.targets)
         return positions
 
@@ -46,43 +46,43 @@ class MockArm(MockBody):
         return ArmModel(mjcf=self._mjcf) if self._mjcf else super().arm_model()
 
     async def limp(self):
-        self.let_go = True
+        self.is_limp = True
 
     async def read_state(self):
-        before = self.places
-        if not (self.blocked or self.let_go):
-            self.places = {
+        before = self.positions
+        if not (self.blocked or self.is_limp):
+            self.positions = {
                 name: at + 0.22 * (self.targets[name] - at) for name, at in before.items()
             }
         joints = tuple(
             Joint(name=name, position=at, velocity=(at - before[name]) / 0.02, effort=0.1)
-            for name, at in self.places.items()
+            for name, at in self.positions.items()
         )
-        return replace(await super().read_state(), joints=joints, limp=self.let_go)
+        return replace(await super().read_state(), joints=joints, limp=self.is_limp)
 
 
-class Hearing:
-    """A network on which one process can be frozen: it hears nothing, and that is lost."""
+class FreezableNetwork:
+    """A network for one process. While it is frozen, the process misses all messages."""
 
     def __init__(self, network):
         self._network, self.frozen = network, False
 
     def transport(self):
-        made = self._network.transport()
-        subscribe = made.subscribe
-        made.subscribe = lambda key, heard, depth: subscribe(
-            key, lambda *sample: self.frozen or heard(*sample), depth
+        transport = self._network.transport()
+        subscribe = transport.subscribe
+        transport.subscribe = lambda key, handle, depth: subscribe(
+            key, lambda *sample: self.frozen or handle(*sample), depth
         )
-        return made
+        return transport
 
 
 class ArmRobot:
-    """A robot that is an arm: `async with ArmRobot(folder) as robot:`."""
+    """A robot with only an arm: `async with ArmRobot(folder) as robot:`."""
 
     def __init__(self, folder, config=None, mjcf=None):
         self._folder, self._config, self._mjcf = folder, config, mjcf
         self.network, self.clock = LocalNetwork(), FakeClock()
-        self.gateway_network = Hearing(self.network)
+        self.gateway_network = FreezableNetwork(self.network)
         self.state, self.safe = None, True
 
     async def __aenter__(self):
@@ -94,7 +94,7 @@ class ArmRobot:
         process = DriverProcess(config, self.robot, self.arm, bus)
         self._running = asyncio.ensure_future(process.run(lambda: None))
         self.operator = Bus(self.network.transport(), self.clock)
-        self.operator.subscribe(STATE, self._see)
+        self.operator.subscribe(STATE, self._on_state)
         self._stack = AsyncExitStack()
         self.gateway_bus, self.ros = await self._stack.enter_async_context(
             gateway_on(self.gateway_network, self.clock, self._config)
@@ -108,7 +108,7 @@ class ArmRobot:
         self._running.cancel()
         await asyncio.gather(self._running, return_exceptions=True)
 
-    def _see(self, _key, state):
+    def _on_state(self, _key, state):
         self.state = state
         if self.safe:
             self.operator.publish(SAFETY, SafetyState(verdict="ok"), basis=state.tick)
@@ -119,14 +119,14 @@ class ArmRobot:
         assert self.state.gate.mode == "idle"
 
     async def commanded(self):
-        """Have the robot's brain command the arm: control holds it."""
-        self.operator.subscribe(STATE, self._hold)
+        """Let control command the arm to hold its home position, as the brain would."""
+        self.operator.subscribe(STATE, self._command_home)
         await self.go(50)
         await enable(self.operator, "control")
         await self.go(5)
         assert self.state.gate.commander == "control"
 
-    def _hold(self, _key, state):
+    def _command_home(self, _key, state):
         command = JointCommand(name=NAMES, position=self.robot.arm.home, source="control")
         self.operator.publish(JOINT_CMD, command, basis=state.tick)
 
@@ -136,33 +136,33 @@ class ArmRobot:
             self._running.result()
 
     def at(self, name):
-        """Return where a joint is."""
-        return self.arm.places[name]
+        """Return the position of a joint."""
+        return self.arm.positions[name]
 
     def diagnostics(self):
-        """Return the newest statuses by name."""
+        """Return the newest diagnostic statuses by name."""
         found = self.node.received["/diagnostics"][-1].status
-        return {one.name: one for one in found}
+        return {each.name: each for each in found}
 
     def trajectory(self, *points, names=("shoulder_pan",), **fields):
-        """Return a message: points are (seconds, positions...)."""
-        made = [
+        """Return a JointTrajectory; points are (seconds, positions...)."""
+        messages = [
             TYPES.make(
-                POINT, positions=np.array(places, float),
+                POINT, positions=np.array(positions, float),
                 time_from_start={"sec": int(t), "nanosec": round(t % 1 * 1e9)},
             )
-            for t, *places in points
+            for t, *positions in points
         ]  # fmt: skip
-        return TYPES.make(TRAJECTORY, joint_names=list(names), points=made, **fields)
+        return TYPES.make(TRAJECTORY, joint_names=list(names), points=messages, **fields)
 
     def publish(self, message):
-        """Publish a trajectory on the topic."""
+        """Publish a trajectory on /joint_trajectory."""
         self.node.publish("/joint_trajectory", TRAJECTORY, header=message.header,
                           joint_names=message.joint_names, points=message.points)  # fmt: skip
 
 
 class Client:
-    """A client of the action."""
+    """A client of the action /follow_joint_trajectory."""
 
     BASE = "/follow_joint_trajectory/_action"
 
@@ -172,14 +172,17 @@ class Client:
 
     @property
     def feedback(self):
-        return [one.feedback for one in self._robot.node.received[f"{self.BASE}/feedback"]]
+        return [each.feedback for each in self._robot.node.received[f"{self.BASE}/feedback"]]
 
     async def send(self, message, **goal):
         """Send a goal; return its id."""
         id = uuid.uuid4().bytes
-        made = TYPES.make(f"{FOLLOW_TYPE}_Goal", trajectory=message, **goal)
+        goal_message = TYPES.make(f"{FOLLOW_TYPE}_Goal", trajectory=message, **goal)
         answer = await self._robot.node.call(
-            f"{self.BASE}/send_goal", f"{FOLLOW_TYPE}_SendGoal", goal_id={"uuid": id}, goal=made
+            f"{self.BASE}/send_goal",
+            f"{FOLLOW_TYPE}_SendGoal",
+            goal_id={"uuid": id},
+            goal=goal_message,
         )
         assert answer.accepted
         return id
@@ -190,7 +193,7 @@ class Client:
         return await self._robot.node.call(service, "action_msgs/srv/CancelGoal", goal_info=info)
 
     async def result(self, id):
-        """Return status, error code and text; time has to have passed before."""
+        """Return status, error code and text; call it after the end of the goal."""
         service = f"{self.BASE}/get_result"
         answer = await self._robot.node.call(service, f"{FOLLOW_TYPE}_GetResult",
                                              goal_id={"uuid": id})  # fmt: skip

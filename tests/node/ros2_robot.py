@@ -1,4 +1,4 @@
-"""A whole robot in memory with the gateway, and a node of ROS that talks to it."""
+"""A whole robot in memory with the gateway, and a ROS node that communicates with it."""
 
 import asyncio
 from collections import defaultdict
@@ -17,7 +17,7 @@ TICK_NS = 20_000_000
 
 
 class RosNode:
-    """A node of ROS: what it has received, by topic, and what it sends."""
+    """A ROS node: keeps received messages by topic, publishes, and calls services."""
 
     def __init__(self, network, clock):
         self.transport = network.transport(Ros2Link(node="rclpy"))
@@ -25,10 +25,10 @@ class RosNode:
         self.clock, self.publishers = clock, {}
 
     def read(self, topic, type, qos=DEFAULT):
-        """Subscribe; returns the function that ends it."""
+        """Subscribe; return a function that ends the subscription."""
         messages = self.received[topic]
         return self.transport.subscribe(
-            topic, type, qos, lambda got: messages.append(TYPES.decode(type, got.payload))
+            topic, type, qos, lambda received: messages.append(TYPES.decode(type, received.payload))
         )
 
     def publish(self, topic, type, qos=DEFAULT, **fields):
@@ -43,23 +43,23 @@ class RosNode:
                      linear={"x": x, "y": y}, angular={"z": turn})  # fmt: skip
 
     async def call(self, service, type, **fields):
-        """Return the response of a service, while no time passes but the loop's."""
+        """Return the response of a service. The fake clock does not advance."""
         request = TYPES.encode(f"{type}_Request", TYPES.make(f"{type}_Request", **fields))
         reply = await self.transport.call(service, type, request, 30.0)
         return TYPES.decode(f"{type}_Response", reply)
 
     def topics(self):
-        """Return the topics of others by name, without those of actions: their type and QoS."""
+        """Return (type, QoS) of the topics of other nodes by name, without those of actions."""
         return {
-            one.topic: (one.type, one.qos)
-            for one in self.transport.endpoints()
-            if not one.ours and one.kind == "publisher" and "/_action/" not in one.topic
+            each.topic: (each.type, each.qos)
+            for each in self.transport.endpoints()
+            if not each.ours and each.kind == "publisher" and "/_action/" not in each.topic
         }
 
 
 @asynccontextmanager
 async def gateway_on(network, clock, config=None, transport_of=None):
-    """Yield the gateway's bus and network of ROS, beside a robot's network."""
+    """Run a gateway on a robot's network; yield its bus and its ROS network."""
     config = config or Ros2Config()
     ros = MemoryNetwork(TYPES, clock.unix_ns)
     bus, ready = Bus(network.transport(), clock, "ros2"), asyncio.Event()
@@ -96,7 +96,7 @@ class RosRobot(RobotInMemory):
         await super().__aexit__(*error)
 
     async def streams(self, ticks, every=2, x=0.2, turn=0.0):
-        """Let a publisher send each `every` ticks; return the body's speed in each tick."""
+        """Publish a Twist every `every` ticks; return the body's speed in each tick."""
         speeds = []
         for number in range(ticks):
             if number % every == 0:

@@ -86,16 +86,18 @@ async def test_a_goal_is_a_task_and_its_state_is_answered_at_once():
     async with adapter() as rmf:
         rmf.read("navigate_to_pose/_action/feedback")
         assert await rmf.send(1)
-        assert rmf.brain.asked == [(2.0, 1.0, 0.0, "replace")]
+        assert rmf.brain.requests == [(2.0, 1.0, 0.0, "replace")]
         assert await rmf.status(1) == 2
-        await rmf.brain.say("active", path=((0.0, 0.0), (2.0, 1.0)), distance_remaining=2.25, eta=9)
+        await rmf.brain.publish_task(
+            "active", path=((0.0, 0.0), (2.0, 1.0)), distance_remaining=2.25, eta=9
+        )
         (message,) = rmf.received["navigate_to_pose/_action/feedback"]
         assert message.goal_id.uuid.tolist() == [1] * 16
         told = message.feedback
         assert (told.distance_remaining, told.estimated_time_remaining.sec) == (2.25, 9)
         assert told.current_pose.header.frame_id == "map"
         assert await rmf.status(1) == 2
-        await rmf.brain.say("succeeded")
+        await rmf.brain.publish_task("succeeded")
         assert await rmf.status(1) == 4
 
 
@@ -103,7 +105,7 @@ async def test_the_zero_id_cancels_every_goal_also_those_of_ros():
     async with adapter() as rmf:
         await rmf.send(1)
         assert await rmf.cancel(EVERY_GOAL) == 0
-        assert rmf.brain.asked[1:] == [("cancel", "goal-1")]
+        assert rmf.brain.requests[1:] == [("cancel", "goal-1")]
         assert await rmf.status(1) == 5
         ros = Client(rmf.brain, rmf.node)
         await ros.send(2)
@@ -114,7 +116,7 @@ async def test_the_zero_id_cancels_every_goal_also_those_of_ros():
 async def test_a_goal_that_fails_or_is_not_known_has_such_a_state():
     async with adapter() as rmf:
         await rmf.send(1)
-        await rmf.brain.say("failed", reason="gave up")
+        await rmf.brain.publish_task("failed", reason="gave up")
         assert await rmf.status(1) == 6
         assert await rmf.status(9) == 0
         await rmf.send(2, frame="somewhere")
@@ -129,9 +131,9 @@ async def test_goals_of_ros_and_of_open_rmf_preempt_each_other():
         assert await ros.result(1) == (6, 0)
         await ros.send(3)
         assert await rmf.status(2) == 6
-        await rmf.brain.say("succeeded", "goal-3")
+        await rmf.brain.publish_task("succeeded", "goal-3")
         assert await ros.result(3) == (4, 0)
-        assert rmf.brain.asked == [
+        assert rmf.brain.requests == [
             (2.0, 1.0, 0.0, "replace"), (1.5, 1.0, 0.0, "replace"), (2.0, 1.0, 0.0, "replace"),
         ]  # fmt: skip
 
@@ -141,7 +143,7 @@ async def test_states_of_goals_are_published_as_they_change():
         rmf.read("navigate_to_pose/_action/status")
         await rmf.send(1)
         await until(lambda: told(rmf) == [[2]], "it is carried out")
-        await rmf.brain.say("succeeded")
+        await rmf.brain.publish_task("succeeded")
         await until(lambda: told(rmf) == [[2], [4]], "its end")
 
 
@@ -219,7 +221,7 @@ async def test_a_bad_request_is_refused_counted_and_said_once(name, payload, rea
         said = [one for one in caplog.messages if "refused a request of" in one]
         assert len(said) == 1
         assert f"navigate_to_pose/_action/{name}" in said[0]
-        assert rmf.brain.asked == []
+        assert rmf.brain.requests == []
         assert await rmf.send(1)
 
 

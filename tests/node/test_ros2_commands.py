@@ -18,12 +18,12 @@ DIAGNOSTICS = "diagnostic_msgs/msg/DiagnosticArray"
 
 @pytest.fixture(autouse=True)
 def _patient(monkeypatch):
-    """Let no slow disk of this machine cause a second press of the e-stop."""
+    """Prevent that a slow disk of this machine delays the answer, and the e-stop is repeated."""
     monkeypatch.setattr(requests, "FIRST_S", 1.9)
 
 
 async def released(robot):
-    """Let the robot start, and release it by ROS."""
+    """Let the robot start, and release it by the ROS service."""
     await robot.go(60)
     assert (await robot.node.call("/release", TRIGGER)).success
     await robot.go(5)
@@ -47,7 +47,7 @@ async def test_a_killed_publisher_brakes_the_body_within_120_ms_of_its_period(tm
     async with RosRobot(tmp_path) as robot:
         await released(robot)
         await robot.streams(100, every)
-        speeds = await robot.go(60)  # it was last heard a period ago, less a tick
+        speeds = await robot.go(60)  # the last command is a period old, less a tick
         assert speeds[0] == pytest.approx(0.2)
         braking = ticks_until(speeds, lambda speed: speed < 0.199)
         assert braking - 1 <= 1 + 120 / 20
@@ -61,13 +61,13 @@ async def test_a_late_publisher_neither_brakes_the_body_nor_loses_it(tmp_path):
         await robot.streams(100, 5)
         speeds = [*await robot.go(3), *await robot.streams(100, 5)]  # 160 ms once
         assert min(speeds) == pytest.approx(0.2)
-        await robot.go(12)  # 340 ms: it brakes, and goes on
+        await robot.go(12)  # 340 ms: it brakes, but stays enabled
         assert robot.mode == "enabled"
         assert (await robot.streams(40, 5))[-1] == pytest.approx(0.2)
         assert robot.state.gate.enables == 1
 
 
-async def test_the_body_is_free_within_half_a_second_of_being_given_back(tmp_path):
+async def test_the_body_is_idle_within_half_a_second_after_the_last_command(tmp_path):
     async with RosRobot(tmp_path) as robot:
         await released(robot)
         await robot.streams(50)
@@ -78,7 +78,7 @@ async def test_the_body_is_free_within_half_a_second_of_being_given_back(tmp_pat
         assert (await robot.streams(30))[-1] == pytest.approx(0.2)
 
 
-async def test_while_the_brain_drives_ros_is_refused_and_named(tmp_path):
+async def test_while_the_brain_drives_commands_of_ros_are_refused_and_reported(tmp_path):
     async with RosRobot(tmp_path) as robot:
         await released(robot)
         await robot.go(50)
@@ -87,7 +87,7 @@ async def test_while_the_brain_drives_ros_is_refused_and_named(tmp_path):
         robot.node.read("/diagnostics", DIAGNOSTICS)
         await robot.streams(60, x=-0.2)
         assert robot.state.gate.commander == "control"
-        status = {one.name: one for one in robot.node.received["/diagnostics"][-1].status}
+        status = {each.name: each for each in robot.node.received["/diagnostics"][-1].status}
         found = status["gigabrain: cmd_vel"]
         assert found.level == 1
         assert "control drives" in found.message
@@ -96,7 +96,7 @@ async def test_while_the_brain_drives_ros_is_refused_and_named(tmp_path):
         assert problem.code == "ros2_cmd_vel"
 
 
-async def test_take_by_the_settings_takes_the_body_from_the_brain(tmp_path):
+async def test_with_the_setting_take_ros_takes_the_body_from_the_brain(tmp_path):
     async with RosRobot(tmp_path, config=Ros2Config(take=True)) as robot:
         await released(robot)
         await robot.go(50)
@@ -153,7 +153,7 @@ def stamped(robot, age_ms, x=0.2, frame="base_link"):
     )  # fmt: skip
 
 
-async def test_a_stamped_twist_is_judged_by_its_stamp(tmp_path):
+async def test_a_stamped_twist_is_refused_by_its_stamp_if_old_or_in_the_future(tmp_path):
     async with RosRobot(tmp_path) as robot:
         await released(robot)
         for age_ms, code in ((300, "stale"), (-200, "future")):
@@ -168,7 +168,7 @@ async def test_a_stamped_twist_is_judged_by_its_stamp(tmp_path):
         assert robot.mode == "enabled"
 
 
-async def test_a_body_that_cannot_move_sideways_does_not(tmp_path):
+async def test_a_sideways_command_is_refused_by_a_body_that_cannot_do_it(tmp_path):
     async with RosRobot(tmp_path) as robot:
         await released(robot)
         for _ in range(30):
@@ -202,7 +202,7 @@ async def test_an_estop_from_ros_stops_the_body_within_a_tick(tmp_path):
         assert robot.causes == ["estop"]
 
 
-async def test_an_estop_is_released_by_release_only(tmp_path):
+async def test_only_the_service_release_ends_an_estop(tmp_path):
     async with RosRobot(tmp_path) as robot:
         await released(robot)
         await robot.streams(50)
@@ -221,7 +221,7 @@ async def test_an_estop_is_released_by_release_only(tmp_path):
         assert robot.mode == "idle"
 
 
-async def test_a_stream_that_goes_on_through_estop_and_release_moves_nothing(tmp_path):
+async def test_commands_that_continue_through_estop_and_release_move_nothing(tmp_path):
     async with RosRobot(tmp_path) as robot:
         await released(robot)
         await robot.streams(50)
@@ -247,7 +247,7 @@ async def test_enable_lets_the_brain_drive_and_takes_the_body_from_ros_alone(tmp
         assert (response.success, "ann drives" in response.message) == (False, True)
 
 
-async def test_services_say_what_is_missing_when_the_driver_is_silent(tmp_path):
+async def test_services_name_the_driver_when_it_is_silent(tmp_path):
     async with RosRobot(tmp_path) as robot:
         await robot.go(20)
         await robot.kill("driver")
@@ -259,7 +259,7 @@ async def test_services_say_what_is_missing_when_the_driver_is_silent(tmp_path):
         assert robot.gateway_bus.counters["cmd_vel_no_robot"] == 1
 
 
-async def test_map_save_says_who_would_make_a_map(tmp_path):
+async def test_map_save_names_the_setting_that_makes_a_map(tmp_path):
     async with RosRobot(tmp_path) as robot:
         await robot.go(5)
         response = await robot.node.call("/map_save", TRIGGER)
@@ -281,7 +281,7 @@ async def test_maps_that_are_saved_within_a_second_have_different_names(tmp_path
         assert len(set(names)) == 3
 
 
-async def test_the_gateway_sends_nothing_to_the_gate_unasked(tmp_path):
+async def test_the_gateway_sends_only_its_health_without_commands(tmp_path):
     async with RosRobot(tmp_path) as robot:
         await released(robot)
         await robot.go(100)

@@ -1,4 +1,4 @@
-"""The driver of a ROS 2 robot, with the robot's nodes in memory and a clock that the test moves."""
+"""The driver of a ROS 2 robot, with the robot's nodes in memory and a fake clock."""
 
 import contextlib
 import math
@@ -36,13 +36,13 @@ TOPICS: dict[str, Any] = {
 
 
 class Robot:
-    """The robot's nodes. It does what it is told at once."""
+    """The robot's nodes. It obeys a command at once."""
 
     def __init__(self, network: MemoryNetwork, clock: FakeClock, command: str = STAMPED) -> None:
         self.network, self.clock, self.types = network, clock, network.types
         self.obeyed: list[tuple[float, float]] = []
         self.x = self.yaw = self.speed = self.turn = 0.0
-        self.child_frame, self.talks = "base_footprint", True
+        self.child_frame, self.reports = "base_footprint", True
         self._command = command
         self.start()
 
@@ -104,7 +104,7 @@ class Robot:
 
 
 class Bench:
-    """A driver, a robot, and time."""
+    """A driver, a robot, and a fake clock."""
 
     def __init__(self, options: Ros2Options, *, command: str = STAMPED) -> None:
         self.clock = FakeClock()
@@ -120,17 +120,17 @@ class Bench:
         )
 
     async def pass_ms(self, ms: int) -> None:
-        """Let time pass; the robot reports each 50 ms."""
+        """Advance the clock; the robot reports every 50 ms."""
         for _ in range(ms // 10):
             await self.clock.advance(10 * MS)
-            if self.robot.talks and self.clock.now_ns() % (50 * MS) == 0:
+            if self.robot.reports and self.clock.now_ns() % (50 * MS) == 0:
                 self.robot.x += self.robot.speed * 0.05
                 self.robot.yaw += self.robot.turn * 0.05
                 self.robot.odometry()
             await settle()
 
     async def lost_after_ms(self) -> int:
-        """Let time pass until the link is lost; return how long that took."""
+        """Advance the clock until the link is lost; return the time [ms] that it took."""
         for ms in range(0, 2000, 10):
             if not (await self.driver.read_state()).link.connected:
                 return ms
@@ -150,31 +150,31 @@ class Bench:
             await self.pass_ms(20)
 
 
-def made(**changes: Any) -> Ros2Options:
+def options_with(**changes: Any) -> Ros2Options:
     given = {"driver": "ros2", "transport": "dds", "watchdog": "none", "topics": TOPICS} | changes
     return msgspec.convert(given, Ros2Options)
 
 
 @contextlib.asynccontextmanager
 async def running(options: Ros2Options | None = None, **more: Any) -> AsyncIterator[Bench]:
-    bench = Bench(options or made(), **more)
+    bench = Bench(options or options_with(), **more)
     await bench.driver.open()
     try:
         await until(lambda: bench.driver.link.transport, "the driver's node")
         yield bench
     finally:
         bench.robot.speed = bench.robot.turn = 0.0
-        bench.driver._connected = False  # nothing to wait for: time stands still
+        bench.driver._connected = False  # so that close waits for nothing: the clock stands still
         await bench.driver.close()
 
 
 @pytest.fixture
 async def bench() -> AsyncIterator[Bench]:
-    async with running() as made:
-        yield made
+    async with running() as bench:
+        yield bench
 
 
-async def test_it_is_found_once_it_reports_and_takes_commands(bench: Bench) -> None:
+async def test_a_robot_is_found_once_it_reports_and_takes_commands(bench: Bench) -> None:
     assert not (await bench.driver.read_state()).link.connected
     assert bench.driver.problem == "odom: no message yet"
     assert await bench.found_after_ms() <= 60
@@ -182,8 +182,10 @@ async def test_it_is_found_once_it_reports_and_takes_commands(bench: Bench) -> N
 
 
 @pytest.mark.parametrize("error", [OSError(24, "Too many open files"), RuntimeError("no thread")])
-async def test_a_fault_while_joining_is_named_and_joining_goes_on(error: Exception) -> None:
-    bench = Bench(made())
+async def test_an_error_while_joining_is_reported_and_joining_is_tried_again(
+    error: Exception,
+) -> None:
+    bench = Bench(options_with())
     link, good = bench.driver.link, bench.driver.link._opener
 
     def fails() -> Any:
@@ -209,13 +211,13 @@ async def test_commands_arrive_in_the_robots_steps_and_are_repeated(bench: Bench
     assert 4 <= len(bench.robot.obeyed) <= 6
 
 
-async def test_a_robot_that_was_never_seen_is_not_moved(bench: Bench) -> None:
-    bench.robot.talks = False
+async def test_a_robot_is_not_commanded_before_its_first_message(bench: Bench) -> None:
+    bench.robot.reports = False
     await bench.drive(200)
     assert set(bench.robot.obeyed) <= {(0.0, 0.0)}
 
 
-async def test_without_commands_it_stands_within_100_ms(bench: Bench) -> None:
+async def test_without_commands_the_robot_gets_zero_within_100_ms(bench: Bench) -> None:
     await bench.found_after_ms()
     await bench.drive(200)
     assert bench.robot.speed > 0.19
@@ -223,10 +225,10 @@ async def test_without_commands_it_stands_within_100_ms(bench: Bench) -> None:
     assert bench.robot.speed == 0.0
     before = len(bench.robot.obeyed)
     await bench.pass_ms(500)
-    assert 10 <= len(bench.robot.obeyed) - before <= 13  # and it is told so, again and again
+    assert 10 <= len(bench.robot.obeyed) - before <= 13  # zero is repeated
 
 
-async def test_nan_and_what_is_too_fast_do_not_get_through(bench: Bench) -> None:
+async def test_nan_and_excessive_speeds_do_not_reach_the_robot(bench: Bench) -> None:
     await bench.found_after_ms()
     sent = await bench.driver.set_base_velocity(math.nan, 0.0, 1.0)
     assert (sent.linear_x, sent.angular_z) == (0.0, 0.0)
@@ -234,14 +236,14 @@ async def test_nan_and_what_is_too_fast_do_not_get_through(bench: Bench) -> None
     assert sent.linear_x == pytest.approx(0.21)
 
 
-async def test_silence_loses_the_link_and_stops_and_it_is_found_again(bench: Bench) -> None:
+async def test_a_silent_robot_is_stopped_lost_and_found_again(bench: Bench) -> None:
     await bench.found_after_ms()
     await bench.drive(200)
-    bench.robot.talks = False
+    bench.robot.reports = False
     assert await bench.lost_after_ms() <= 250
     assert "odom: no message for" in bench.driver.problem
     assert bench.robot.speed == 0.0
-    bench.robot.talks = True
+    bench.robot.reports = True
     assert await bench.found_after_ms() <= 3000
     assert (await bench.driver.read_state()).link.reconnects == 1
 
@@ -258,7 +260,7 @@ async def test_a_robot_whose_nodes_died_is_lost_and_found_again(bench: Bench) ->
     assert (await bench.driver.read_state()).pose.x == pytest.approx(pose.x, abs=0.02)
 
 
-async def test_an_odometry_that_was_reset_is_lost_for_a_moment(bench: Bench) -> None:
+async def test_a_reset_of_the_odometry_loses_the_link_for_a_moment(bench: Bench) -> None:
     await bench.found_after_ms()
     await bench.drive(1000)
     pose = (await bench.driver.read_state()).pose
@@ -277,27 +279,27 @@ async def test_nan_in_the_odometry_loses_the_link(bench: Bench) -> None:
     assert await bench.found_after_ms() <= 3000
 
 
-async def test_another_child_frame_is_refused_by_name(bench: Bench) -> None:
+async def test_odometry_with_another_child_frame_is_rejected_by_name(bench: Bench) -> None:
     bench.robot.child_frame = "camera"
     await bench.pass_ms(100)
     assert "its child frame is 'camera'; expected 'base_footprint'" in bench.driver.problem
 
 
-async def test_nobody_who_takes_commands_of_our_type_is_named() -> None:
+async def test_a_robot_without_a_subscriber_of_our_type_is_a_problem() -> None:
     async with running(command=TWIST) as bench:
         await bench.pass_ms(200)
         assert bench.driver.problem == "cmd_vel: no node takes our commands"
 
 
-async def test_twist_without_a_stamp_is_obeyed_too() -> None:
+async def test_a_robot_that_takes_twist_without_a_stamp_is_driven() -> None:
     topics = TOPICS | {"command": {"type": TWIST}}
-    async with running(made(topics=topics), command=TWIST) as bench:
+    async with running(options_with(topics=topics), command=TWIST) as bench:
         await bench.found_after_ms()
         await bench.drive(100, 0.123)
         assert bench.robot.speed == 0.123
 
 
-async def test_all_sensors_become_ours(bench: Bench) -> None:
+async def test_all_sensors_are_converted_to_our_messages(bench: Bench) -> None:
     await bench.found_after_ms()
     robot = bench.robot
     robot.scan([1.0] * 230)
@@ -326,7 +328,7 @@ async def test_an_inertial_unit_without_orientation_is_logged_once(
     state = await bench.driver.read_state()
     assert state.imu
     assert state.imu.orientation == (0.0, 0.0, 0.0, 0.0)
-    assert [one for one in caplog.messages if "tilt_stop" in one] == [
+    assert [each for each in caplog.messages if "tilt_stop" in each] == [
         "imu: it has no orientation (orientation_covariance[0] is -1), so tilt_stop cannot stop "
         "the robot; have a filter add it, such as imu_filter_madgwick, and write its topic as "
         "topics.imu.name"
@@ -335,7 +337,7 @@ async def test_an_inertial_unit_without_orientation_is_logged_once(
     assert "imu: it has an orientation" in caplog.messages
 
 
-async def test_sensors_that_are_silent_are_no_longer_reported(bench: Bench) -> None:
+async def test_values_of_silent_sensors_are_no_longer_reported(bench: Bench) -> None:
     await bench.found_after_ms()
     for _ in range(5):
         bench.robot.send("imu", linear_acceleration={"z": 9.81})
@@ -352,7 +354,7 @@ async def test_sensors_that_are_silent_are_no_longer_reported(bench: Bench) -> N
     assert after.link.connected
 
 
-async def test_what_cannot_be_decoded_is_dropped_and_counted(bench: Bench) -> None:
+async def test_malformed_messages_are_dropped_and_counted(bench: Bench) -> None:
     await bench.found_after_ms()
     bench.robot.publishers["scan"][0].publish(b"\0\1\0\0nonsense")
     bench.robot.scan([1.0])
@@ -369,8 +371,8 @@ def link(types: Any, parent: str, child: str, x: float, yaw: float) -> dict[str,
     }
 
 
-async def test_with_tf_static_scans_are_placed_by_the_robots_own_frames() -> None:
-    async with running(made(mounting="tf_static")) as bench:
+async def test_with_tf_static_scans_are_transformed_by_the_robots_frames() -> None:
+    async with running(options_with(mounting="tf_static")) as bench:
         robot = bench.robot
         robot.scan([1.0, 9.0, 9.0, 9.0])
         assert await bench.driver.get_sensor_data("scan") is None  # its frame is not known yet
@@ -391,7 +393,7 @@ async def test_with_tf_static_scans_are_placed_by_the_robots_own_frames() -> Non
         assert ranges[[110, 165, 0, 55]] == pytest.approx([1.0, 2.0, 3.0, 4.0])
 
 
-async def test_closing_sends_zero_until_the_robot_stands(bench: Bench) -> None:
+async def test_closing_sends_zero_until_the_robot_is_at_rest(bench: Bench) -> None:
     await bench.found_after_ms()
     await bench.drive(200)
     bench.robot.obeyed.clear()

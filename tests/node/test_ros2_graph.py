@@ -1,4 +1,4 @@
-"""The gateway's report on the ROS graph: our keys, QoS mismatches, and clocks."""
+"""The gateway's report on the ROS graph: keys of our topics, QoS mismatches, and clocks."""
 
 import asyncio
 
@@ -33,12 +33,12 @@ async def test_each_topic_service_and_action_of_the_gateway_has_a_key_of_ours() 
 
 
 async def problems(robot):
-    """Return the problems in the gateway's health once it has looked at the graph again."""
+    """Return the problems in the gateway's health after the next check of the graph."""
     await robot.states(350)
-    return [(one.code, one.text, one.remedy) for one in robot.gateway_bus.problems]
+    return [(each.code, each.text, each.remedy) for each in robot.gateway_bus.problems]
 
 
-async def test_a_reader_that_wants_more_is_a_problem_until_it_goes() -> None:
+async def test_a_reader_with_a_mismatched_qos_is_a_problem_until_it_leaves() -> None:
     async with driver(DDS) as robot:
         await robot.body()
         assert await problems(robot) == []
@@ -51,8 +51,8 @@ async def test_a_reader_that_wants_more_is_a_problem_until_it_goes() -> None:
         ]  # fmt: skip
         robot.node.read("/red/diagnostics", "diagnostic_msgs/msg/DiagnosticArray")
         await robot.states(60)
-        statuses = robot.got("/red/diagnostics")[-1].status
-        (graph,) = [one for one in statuses if one.name == "gigabrain: graph"]
+        statuses = robot.received("/red/diagnostics")[-1].status
+        (graph,) = [each for each in statuses if each.name == "gigabrain: graph"]
         assert (graph.level, graph.message.startswith("/red/scan: nothing passes")) == (1, True)
         close()
         assert await problems(robot) == []
@@ -77,7 +77,7 @@ async def test_a_second_robot_with_the_same_names_is_a_problem() -> None:
         ({"10.9.9.1"}, {"10.8.8.1", "10.9.9.1"}, False),
     ],
 )
-async def test_a_network_that_came_or_changed_after_joining_dds_is_a_problem(
+async def test_a_network_that_appears_or_changes_after_joining_dds_is_a_problem(
     before: set[str], after: set[str], seen: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(graph_watch, "outer_addresses", lambda: before)
@@ -94,7 +94,7 @@ async def test_a_network_that_came_or_changed_after_joining_dds_is_a_problem(
             assert "restart" in remedy
 
 
-async def test_a_commander_with_another_clock_is_a_problem_while_it_commands() -> None:
+async def test_a_publisher_with_another_clock_is_a_problem_while_it_commands() -> None:
     async with driver() as robot:
         await robot.body()
         await robot.states(1)
@@ -103,7 +103,7 @@ async def test_a_commander_with_another_clock_is_a_problem_while_it_commands() -
         for _ in range(350):
             robot.node.drive()
             await robot.states(1)
-        found = {one.code: one for one in robot.gateway_bus.problems}
+        found = {each.code: each for each in robot.gateway_bus.problems}
         assert found["ros2_clock"].text == (
             "/cmd_vel: the clock of a publisher is 5.0 s ahead of this machine's clock"
         )
@@ -124,7 +124,7 @@ async def test_the_gateway_reports_how_it_has_joined() -> None:
 
 
 async def beside_a_driver(config: Ros2Config) -> "asyncio.Task[None]":
-    """Return a gateway, 2 s after the driver of a ROS 2 robot has joined its domain."""
+    """Return the task of a gateway, 2 s after the driver of a ROS 2 robot joined its domain."""
     clock, ros = FakeClock(), MemoryNetwork(TYPES)
     bus = Bus(LocalNetwork().transport(), clock, "ros2")
     running = asyncio.ensure_future(serve(config, bus, ros.transport(config), TYPES, str))
@@ -137,7 +137,7 @@ async def beside_a_driver(config: Ros2Config) -> "asyncio.Task[None]":
     return running
 
 
-async def test_a_gateway_ends_where_the_body_is_a_ros_robot_with_the_same_topics() -> None:
+async def test_a_gateway_ends_if_the_driver_of_a_ros_robot_uses_its_topics() -> None:
     running = await beside_a_driver(Ros2Config())
     with pytest.raises(ExceptionGroup) as ended:
         await asyncio.wait_for(running, 1.0)
@@ -153,7 +153,9 @@ async def test_a_gateway_ends_where_the_body_is_a_ros_robot_with_the_same_topics
 @pytest.mark.parametrize(
     "config", [Ros2Config(namespace="/gigabrain"), Ros2Config(leave_out=("scan", "cmd_vel"))]
 )
-async def test_a_gateway_with_other_topics_may_be_beside_a_ros_robot(config: Ros2Config) -> None:
+async def test_a_gateway_with_other_topics_runs_beside_the_driver_of_a_ros_robot(
+    config: Ros2Config,
+) -> None:
     running = await beside_a_driver(config)
     assert not running.done()
     running.cancel()
@@ -161,7 +163,7 @@ async def test_a_gateway_with_other_topics_may_be_beside_a_ros_robot(config: Ros
 
 
 @pytest.mark.parametrize("name", ["navigate_to_pos", "/red/map", "diagnostics", ""])
-async def test_a_name_to_leave_out_that_the_gateway_does_not_have_is_refused(name: str) -> None:
+async def test_an_unknown_name_in_leave_out_is_rejected(name: str) -> None:
     config, ros = Ros2Config(leave_out=(name,)), MemoryNetwork(TYPES)
     bus = Bus(LocalNetwork().transport(), FakeClock(), "ros2")
     with pytest.raises(ConfigError, match=r"^ros2: leave_out: no name .*known: .*map, map_save"):

@@ -1,4 +1,4 @@
-"""Mutated messages and requests of other ROS nodes: the gateway works on afterwards."""
+"""Mutated messages and requests of other ROS nodes do not disturb the gateway."""
 
 import random
 
@@ -32,7 +32,7 @@ SERVICES = {
 
 
 def mutated(dice: random.Random, payload: bytes) -> bytes:
-    """Return a payload with some bytes changed, cut off or added."""
+    """Return a payload with changed, missing or additional bytes."""
     data = bytearray(payload)
     for _ in range(dice.randrange(1, 12)):
         data[dice.randrange(len(data))] = dice.choice((0, 1, 0x7F, 0x80, 0xFF, dice.randrange(256)))
@@ -46,7 +46,7 @@ def payload_of(kind: str) -> bytes:
 
 
 @pytest.mark.parametrize("seed", range(4))
-async def test_mutated_messages_end_nothing_and_are_not_obeyed(
+async def test_mutated_messages_are_not_obeyed_and_the_gateway_keeps_working(
     seed: int, caplog: pytest.LogCaptureFixture
 ) -> None:
     dice = random.Random(seed)
@@ -67,15 +67,15 @@ async def test_mutated_messages_end_nothing_and_are_not_obeyed(
         counters = robot.gateway_bus.counters
         assert counters["cmd_vel_broken"] > 0
         assert robot.gateway_bus.sent[CMD_VEL.key] == 0  # control has the body
-        said = [one for one in caplog.messages if "dropped a message" in one]
-        assert len(said) == 1
+        warnings = [each for each in caplog.messages if "dropped a message" in each]
+        assert len(warnings) == 1
         before = counters["cmd_vel_commander"]
         robot.node.drive()
         assert counters["cmd_vel_commander"] == before + 1
 
 
 @pytest.mark.parametrize("seed", range(2))
-async def test_mutated_requests_end_nothing(seed: int) -> None:
+async def test_the_gateway_keeps_working_after_mutated_requests(seed: int) -> None:
     dice = random.Random(seed)
     async with driver() as robot:
         await robot.body()

@@ -25,7 +25,7 @@ REFUSED = "joint_trajectory_refused"
 
 @pytest.fixture(autouse=True)
 def _patient(monkeypatch):
-    """Let no slow disk of this machine cause a second press of the e-stop."""
+    """Prevent that a slow disk of this machine delays the answer, and the e-stop is repeated."""
     monkeypatch.setattr(requests, "FIRST_S", 1.9)
 
 
@@ -37,7 +37,7 @@ async def ready(folder, config=None):
         yield robot, Client(robot)
 
 
-async def test_joint_states_have_all_joints_also_limp_ones(tmp_path):
+async def test_joint_states_have_all_joints_even_if_limp(tmp_path):
     async with ArmRobot(tmp_path) as robot:
         robot.node.read("/joint_states", "sensor_msgs/msg/JointState")
         await robot.go(5)
@@ -56,7 +56,7 @@ LINKS = ["shoulder", "upper_arm", "lower_arm", "wrist", "gripper", "jaw"]  # eac
 
 
 def arm_links(message):
-    return [one.child_frame_id for one in message.transforms if one.child_frame_id in LINKS]
+    return [each.child_frame_id for each in message.transforms if each.child_frame_id in LINKS]
 
 
 async def test_a_description_with_the_whole_arm_and_the_frames_of_its_links_are_published(tmp_path):
@@ -64,26 +64,26 @@ async def test_a_description_with_the_whole_arm_and_the_frames_of_its_links_are_
         robot.node.read("/robot_description", STRING, LATCHED)
         robot.node.read("/tf_static", TF, LATCHED)
         robot.node.read("/tf", TF)
-        robot.arm.places, robot.arm.blocked = {**robot.arm.places, "shoulder_pan": 1.0}, True
+        robot.arm.positions, robot.arm.blocked = {**robot.arm.positions, "shoulder_pan": 1.0}, True
         await robot.go(150)
         (text,) = robot.node.received["/robot_description"]
         urdf = xml.fromstring(text.data)
         kinds = {joint.get("name"): joint.get("type") for joint in urdf.findall("joint")}
         assert [kinds[name] for name in NAMES] == ["revolute"] * 6
         static = robot.node.received["/tf_static"][-1]
-        found = {one.child_frame_id: one.header.frame_id for one in static.transforms}
+        found = {each.child_frame_id: each.header.frame_id for each in static.transforms}
         assert (found["base"], found["tool"]) == ("base_link", "gripper")
         moving = robot.node.received["/tf"][-1]
         assert arm_links(moving) == LINKS
-        pan = next(one for one in moving.transforms if one.child_frame_id == "shoulder")
+        pan = next(each for each in moving.transforms if each.child_frame_id == "shoulder")
         turn = pan.transform.rotation  # about -z
         assert 2 * math.atan2(turn.z, turn.w) == pytest.approx(-1.0)
         joints = {joint.find("child").get("link") for joint in urdf.findall("joint")}
-        frames = {*found, *(one.child_frame_id for one in moving.transforms)}
+        frames = {*found, *(each.child_frame_id for each in moving.transforms)}
         assert joints == frames - {"base_footprint"}
 
 
-async def test_a_model_that_cannot_be_read_leaves_the_rest_of_the_description(tmp_path, caplog):
+async def test_the_description_is_published_without_a_model_that_cannot_be_read(tmp_path, caplog):
     async with ArmRobot(tmp_path, mjcf="<mujoco><worldbody>") as robot:
         robot.node.read("/robot_description", STRING, LATCHED)
         robot.node.read("/tf", TF)
@@ -95,7 +95,7 @@ async def test_a_model_that_cannot_be_read_leaves_the_rest_of_the_description(tm
         assert caplog.text.count("the arm's model cannot be drawn") == 1
 
 
-async def test_a_trajectory_of_the_topic_is_followed_and_the_body_given_back(tmp_path):
+async def test_a_trajectory_on_the_topic_is_followed_and_the_body_becomes_idle(tmp_path):
     async with ready(tmp_path) as (robot, _):
         robot.publish(robot.trajectory((1.0, 0.5, 0.8), names=("shoulder_pan", "gripper")))
         await robot.go(35)
@@ -117,7 +117,7 @@ async def test_a_goal_has_feedback_and_succeeds(tmp_path):
         id = await client.send(robot.trajectory((1.0, 0.5)))
         await robot.go(80)
         assert await client.result(id) == (SUCCEEDED, 0, "")
-        half = next(one for one in client.feedback if one.desired.time_from_start.nanosec >= 5e8)
+        half = next(each for each in client.feedback if each.desired.time_from_start.nanosec >= 5e8)
         assert half.joint_names == list(NAMES)
         assert half.desired.positions[0] == pytest.approx(0.25, abs=0.03)
         assert half.actual.positions[0] == pytest.approx(half.desired.positions[0], abs=0.05)
@@ -126,7 +126,7 @@ async def test_a_goal_has_feedback_and_succeeds(tmp_path):
         assert half.desired.positions[2] == pytest.approx(1.4)
 
 
-async def test_goals_that_cannot_be_followed_abort_with_their_code_and_end_none(tmp_path):
+async def test_an_invalid_goal_is_aborted_with_its_code_and_the_present_one_continues(tmp_path):
     async with ready(tmp_path) as (robot, client):
         good = await client.send(robot.trajectory((2.0, 0.8)))
         await robot.go(20)
@@ -179,7 +179,7 @@ async def test_a_newer_trajectory_preempts_a_goal_without_a_stop(tmp_path, by):
             assert (await client.result(new))[:2] == (SUCCEEDED, 0)
 
 
-async def test_a_joint_that_is_held_up_breaks_the_path_tolerance(tmp_path):
+async def test_a_blocked_joint_violates_the_path_tolerance(tmp_path):
     async with ready(tmp_path) as (robot, client):
         id = await client.send(robot.trajectory((2.0, 1.6)))
         await robot.go(20)
@@ -193,7 +193,7 @@ async def test_a_joint_that_is_held_up_breaks_the_path_tolerance(tmp_path):
         assert robot.state.joints_sent[0] == pytest.approx(where, abs=0.03)  # braked on the way
 
 
-async def test_a_joint_that_does_not_get_there_breaks_the_goal_tolerance(tmp_path):
+async def test_a_joint_that_misses_its_target_violates_the_goal_tolerance(tmp_path):
     async with ready(tmp_path) as (robot, client):
         free = [TYPES.make("control_msgs/msg/JointTolerance", name="shoulder_pan", position=-1.0)]
         robot.arm.blocked = True
@@ -209,7 +209,7 @@ async def test_a_joint_that_does_not_get_there_breaks_the_goal_tolerance(tmp_pat
         assert (await client.result(id))[:2] == (SUCCEEDED, 0)
 
 
-async def test_an_estop_ends_a_goal_and_what_follows_is_refused(tmp_path):
+async def test_an_estop_ends_a_goal_and_later_ones_are_refused(tmp_path):
     async with ready(tmp_path) as (robot, client):
         robot.node.read("/diagnostics", DIAGNOSTICS)
         id = await client.send(robot.trajectory((2.0, 1.6)))
@@ -237,7 +237,7 @@ async def test_an_estop_ends_a_goal_and_what_follows_is_refused(tmp_path):
         assert "gigabrain: joint_trajectory" not in robot.diagnostics()
 
 
-async def test_a_velocity_for_an_arm_without_a_base_is_refused_and_says_so(tmp_path):
+async def test_a_velocity_command_for_an_arm_without_a_base_is_refused_and_reported(tmp_path):
     async with ready(tmp_path) as (robot, _):
         robot.node.read("/diagnostics", DIAGNOSTICS)
         for speed in (0.0, 0.2):
@@ -254,13 +254,13 @@ async def test_a_velocity_for_an_arm_without_a_base_is_refused_and_says_so(tmp_p
 
 
 async def stream(robot, ticks):
-    """Publish a trajectory that goes on a little from what was sent, every second tick."""
+    """Publish a trajectory a little beyond the sent position, every second tick."""
     for _ in range(ticks // 2):
         robot.publish(robot.trajectory((0.1, robot.state.joints_sent[0] + 0.01)))
         await robot.go(2)
 
 
-async def test_a_stream_of_trajectories_does_not_go_on_after_a_stop_until_it_pauses(tmp_path):
+async def test_after_a_stop_a_stream_of_trajectories_is_refused_until_it_pauses(tmp_path):
     async with ready(tmp_path) as (robot, _):
         await stream(robot, 40)
         assert robot.state.gate.commander == "ros2"
@@ -277,11 +277,11 @@ async def test_a_stream_of_trajectories_does_not_go_on_after_a_stop_until_it_pau
         assert robot.at("shoulder_pan") > stays + 0.02
 
 
-async def test_a_frozen_gateway_counts_its_freeze_as_no_pause_of_a_stream(tmp_path):
+async def test_a_freeze_of_the_gateway_is_not_a_pause_of_a_stream(tmp_path):
     async with ready(tmp_path) as (robot, _):
         await stream(robot, 40)
         assert robot.at("shoulder_pan") > 0.02
-        robot.gateway_network.frozen = True  # and its transport to ROS keeps only the newest
+        robot.gateway_network.frozen = True  # its ROS transport keeps only the newest message
         await robot.go(60)
         robot.gateway_network.frozen = False
         await robot.go(3)
@@ -294,7 +294,7 @@ async def test_a_frozen_gateway_counts_its_freeze_as_no_pause_of_a_stream(tmp_pa
         assert robot.at("shoulder_pan") > stays + 0.02
 
 
-async def test_while_the_brain_has_the_arm_ros_is_refused_unless_it_takes_it(tmp_path):
+async def test_while_the_brain_commands_the_arm_ros_is_refused_unless_it_takes_it(tmp_path):
     for take in (False, True):
         async with ready(tmp_path, Ros2Config(take=take)) as (robot, client):
             await robot.commanded()
@@ -316,16 +316,16 @@ async def test_the_gateways_death_stops_the_arm_within_120_ms(tmp_path):
         assert robot.state.joints[0].velocity > 0.7
         await robot._stack.aclose()
         await robot.go(6)
-        sent = [one["shoulder_pan"] for one in robot.arm.history]
+        sent = [each["shoulder_pan"] for each in robot.arm.history]
         await robot.go(20)
-        after = [one["shoulder_pan"] for one in robot.arm.history[len(sent) :]]
+        after = [each["shoulder_pan"] for each in robot.arm.history[len(sent) :]]
         assert after == pytest.approx([after[0]] * len(after), abs=1e-6)
         assert after[0] == pytest.approx(sent[-1], abs=1e-6)
 
 
 async def test_a_base_offers_neither_topic_nor_action(tmp_path):
     async with ArmRobot(tmp_path, Ros2Config(leave_out=("joint_trajectory",))) as robot:
-        found = {one.topic for one in robot.node.transport.endpoints()}
+        found = {each.topic for each in robot.node.transport.endpoints()}
         assert "/joint_trajectory" not in found
         assert "/follow_joint_trajectory/_action/feedback" in found
 
@@ -352,7 +352,7 @@ async def test_mutated_and_wild_messages_move_nothing(tmp_path, seed):
         await robot.go(20)
         assert robot.gateway_bus.counters[REFUSED] > 100
         assert robot.gateway_bus.sent[JOINT_CMD.key] == 0
-        assert np.ptp([one["shoulder_pan"] for one in robot.arm.history]) == 0.0
+        assert np.ptp([each["shoulder_pan"] for each in robot.arm.history]) == 0.0
         id = await client.send(robot.trajectory((0.5, 0.2)))
         await robot.go(60)
         assert (await client.result(id))[:2] == (SUCCEEDED, 0)

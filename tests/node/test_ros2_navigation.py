@@ -1,4 +1,4 @@
-"""Nav2's goals on our tasks: what the robot is asked, feedback, preemption, cancel, codes."""
+"""Nav2's goals become our tasks: requests, feedback, preemption, cancelling, error codes."""
 
 import asyncio
 import math
@@ -35,33 +35,33 @@ FREE = OccupancyGrid(resolution=0.1, width=50, height=50, origin_x=-1.0, origin_
 
 
 class Brain:
-    """Decision as a client sees it, by hand, and the navigator that asks it."""
+    """A stand-in for decision, and the navigator that sends requests to it."""
 
     def __init__(self):
         self.net = Net()
         self.bus = self.net.one
         self.bus.time.boot = samples.BOOT
         self.navigator = Navigator(Scene(self.net.bus("ros2")))
-        self.asked, self.done, self.tick, self.count = [], [], 0, 0
+        self.requests, self.done, self.tick, self.count = [], [], 0, 0
         self.refusal, self.progress = "", []
         self.bus.serve(GOAL, self._goal)
         self.bus.serve(MISSION, self._mission)
         self.bus.serve(TASK_CHANGE, self._change)
 
     async def _goal(self, request):
-        self.asked.append((request.x, request.y, request.yaw, request.how))
+        self.requests.append((request.x, request.y, request.yaw, request.how))
         if self.refusal:
             return GoalReply(ok=False, text=self.refusal)
         self.count += 1
         return GoalReply(ok=True, text="on the way", goal=f"goal-{self.count}")
 
     async def _mission(self, request):
-        self.asked.append(loads(request.mission, "mission"))
+        self.requests.append(loads(request.mission, "mission"))
         self.count += 1
         return MissionReply(ok=True, text="", task=f"mission-{self.count}")
 
     async def _change(self, request):
-        self.asked.append((request.do, request.task))
+        self.requests.append((request.do, request.task))
         return TaskReply(ok=True, text="")
 
     async def located(self, x=0.0, y=0.0, grid=FREE):
@@ -81,7 +81,7 @@ class Brain:
     def begin(self, poses=(THERE,), codes=TO_POSE):
         return asyncio.ensure_future(self.navigator.carry_out(codes, poses, self.progress.append))
 
-    async def say(self, state, name="goal-1", reason="", source="ros2", **about):
+    async def publish_task(self, state, name="goal-1", reason="", source="ros2", **about):
         """Publish the status of a task that is active, or has ended."""
         task = Task(id=name, kind="goal", label="", source=source, state=state, reason=reason)
         if state in ("succeeded", "failed", "cancelled"):
@@ -93,26 +93,30 @@ class Brain:
         await self.settle()
 
 
-async def test_a_goal_is_a_task_and_its_end_is_the_result():
+async def test_a_goal_becomes_a_task_whose_end_is_the_result():
     brain = Brain()
     await brain.located()
     goal = brain.begin()
     await brain.settle()
-    assert brain.asked == [(2.0, 1.0, 0.5, "replace")]
-    await brain.say("active", path=((0.0, 0.0), (2.0, 1.0)), distance_remaining=2.5, eta=11.0)
-    await brain.say("succeeded")
+    assert brain.requests == [(2.0, 1.0, 0.5, "replace")]
+    await brain.publish_task(
+        "active", path=((0.0, 0.0), (2.0, 1.0)), distance_remaining=2.5, eta=11.0
+    )
+    await brain.publish_task("succeeded")
     assert await goal == Outcome(EndState.SUCCEEDED, 0, "")
 
 
-async def test_feedback_tells_place_time_and_way_left():
+async def test_feedback_has_pose_time_and_remaining_distance():
     brain = Brain()
     await brain.located(x=0.5, y=0.25)
     goal = brain.begin()
     await brain.settle()
     brain.net.clock.stall(1_500_000_000)
     await brain.located(x=0.75, y=0.25)
-    await brain.say("active", path=((0.0, 0.0), (2.0, 1.0)), distance_remaining=2.5, eta=11.25)
-    await brain.say("active", name="goal-9", distance_remaining=99.0)
+    await brain.publish_task(
+        "active", path=((0.0, 0.0), (2.0, 1.0)), distance_remaining=2.5, eta=11.25
+    )
+    await brain.publish_task("active", name="goal-9", distance_remaining=99.0)
     (progress,) = brain.progress
     made = feedback(MAKE, "nav2_msgs/action/NavigateToPose", 7_000_000_001, progress)
     assert (made.current_pose.header.frame_id, made.current_pose.header.stamp.sec) == ("map", 7)
@@ -122,26 +126,28 @@ async def test_feedback_tells_place_time_and_way_left():
         11, 250_000_000,
     )  # fmt: skip
     assert (made.distance_remaining, made.number_of_recoveries) == (2.5, 0)
-    await brain.say("succeeded")
+    await brain.publish_task("succeeded")
     await goal
 
 
-async def test_several_poses_are_a_mission_and_feedback_counts_those_left():
+async def test_several_poses_become_a_mission_and_feedback_counts_the_remaining_ones():
     brain = Brain()
     await brain.located()
     goal = brain.begin(STOPS, THROUGH_POSES)
     await brain.settle()
-    (mission,) = brain.asked
+    (mission,) = brain.requests
     assert [step.goto for step in mission.do] == [(1.0, 0.0, 0.0), (1.0, 2.0, 0.0), (3.0, 2.0, 0.0)]
     for at in STOPS:
-        await brain.say("active", "mission-1", goal=Goal(x=at.x, y=at.y + 0.1),
+        await brain.publish_task("active", "mission-1", goal=Goal(x=at.x, y=at.y + 0.1),
                         distance_remaining=0.5, eta=2.0)  # fmt: skip
-    assert [one.poses_left for one in brain.progress] == [3, 2, 1]
-    assert [one.left_m for one in brain.progress] == pytest.approx([4.5, 2.5, 0.5])
-    assert [one.left_s for one in brain.progress] == pytest.approx([2 + 4 / 0.26, 2 + 2 / 0.26, 2])
+    assert [each.poses_left for each in brain.progress] == [3, 2, 1]
+    assert [each.left_m for each in brain.progress] == pytest.approx([4.5, 2.5, 0.5])
+    assert [each.left_s for each in brain.progress] == pytest.approx(
+        [2 + 4 / 0.26, 2 + 2 / 0.26, 2]
+    )
     action = "nav2_msgs/action/NavigateThroughPoses"
     assert feedback(MAKE, action, 0, brain.progress[1]).number_of_poses_remaining == 2
-    await brain.say("succeeded", "mission-1")
+    await brain.publish_task("succeeded", "mission-1")
     assert (await goal).state is EndState.SUCCEEDED
 
 
@@ -153,7 +159,7 @@ async def test_a_cancel_cancels_the_task():
     goal.cancel()
     await brain.settle()
     assert goal.cancelled()
-    assert brain.asked[1:] == [("cancel", "goal-1")]
+    assert brain.requests[1:] == [("cancel", "goal-1")]
 
 
 async def test_a_cancel_before_the_answer_cancels_the_task_that_was_accepted():
@@ -164,7 +170,7 @@ async def test_a_cancel_before_the_answer_cancels_the_task_that_was_accepted():
     goal.cancel()
     with pytest.raises(asyncio.CancelledError):
         await goal
-    assert brain.asked == [(2.0, 1.0, 0.5, "replace"), ("cancel", "goal-1")]
+    assert brain.requests == [(2.0, 1.0, 0.5, "replace"), ("cancel", "goal-1")]
 
 
 async def test_a_new_goal_replaces_the_task_without_a_cancel_between():
@@ -175,12 +181,12 @@ async def test_a_new_goal_replaces_the_task_without_a_cancel_between():
     new = brain.begin((replace(THERE, x=1.5),))
     old.cancel()
     await brain.settle()
-    assert brain.asked == [(2.0, 1.0, 0.5, "replace"), (1.5, 1.0, 0.5, "replace")]
-    await brain.say("succeeded", "goal-2")
+    assert brain.requests == [(2.0, 1.0, 0.5, "replace"), (1.5, 1.0, 0.5, "replace")]
+    await brain.publish_task("succeeded", "goal-2")
     assert (await new).state is EndState.SUCCEEDED
 
 
-async def test_a_new_goal_that_is_refused_ends_the_task_before_as_well():
+async def test_a_new_goal_ends_the_previous_task_even_if_it_is_refused():
     brain = Brain()
     await brain.located()
     old = brain.begin()
@@ -189,7 +195,7 @@ async def test_a_new_goal_that_is_refused_ends_the_task_before_as_well():
     new = brain.begin()
     old.cancel()
     assert (await new).state is EndState.ABORTED
-    assert brain.asked[2:] == [("cancel", "goal-1")]
+    assert brain.requests[2:] == [("cancel", "goal-1")]
 
 
 async def test_a_task_that_another_client_ends_is_aborted_with_its_reason():
@@ -197,7 +203,7 @@ async def test_a_task_that_another_client_ends_is_aborted_with_its_reason():
     await brain.located()
     goal = brain.begin()
     await brain.settle()
-    await brain.say("cancelled", reason="cancelled by ann")
+    await brain.publish_task("cancelled", reason="cancelled by ann")
     assert await goal == Outcome(EndState.ABORTED, 9000, "cancelled by ann")
 
 
@@ -207,8 +213,8 @@ async def test_a_task_that_fails_has_the_code_of_the_controller_or_the_planner(p
     await brain.located()
     goal = brain.begin()
     await brain.settle()
-    await brain.say("active", path=path)
-    await brain.say("failed", reason="gave up")
+    await brain.publish_task("active", path=path)
+    await brain.publish_task("failed", reason="gave up")
     assert await goal == Outcome(EndState.ABORTED, code, "gave up")
 
 
@@ -266,13 +272,13 @@ def ros_goal(frame="map", x=2.0, w=1.0):
         ([ros_goal()] * 201, "", 9000),
     ],
 )
-def test_goals_that_cannot_be_have_a_code_and_a_text(poses, tree, code):
+def test_an_invalid_goal_has_an_error_code_and_a_text(poses, tree, code):
     fault = requested(TO_POSE, poses, tree, None).fault
     assert (fault.state, fault.code) == (EndState.ABORTED, code)
     assert fault.text
 
 
-def test_goals_in_odom_are_turned_into_the_map():
+def test_goals_in_odom_are_transformed_to_the_map():
     odom = Pose(x=10.0, y=0.0, yaw=math.pi / 2)
     (found,) = requested(TO_POSE, [ros_goal("odom")], "", odom).poses
     assert (found.x, found.y, found.yaw) == pytest.approx((9.0, 2.0, math.pi / 2))
@@ -283,14 +289,14 @@ THROUGH = "nav2_msgs/action/NavigateThroughPoses"
 
 
 class Client:
-    """A client of the gateway's actions, on ROS in memory."""
+    """A client of the gateway's actions, on a ROS network in memory."""
 
     def __init__(self, brain, node):
         self.brain, self.node = brain, node
         self.results = {}
 
     async def send(self, number, poses=None, name="/navigate_to_pose", **fields):
-        """Send a goal, and wait for its result beside; returns whether it was accepted."""
+        """Send a goal, and request its result in a task; return whether the goal was accepted."""
         kind = THROUGH if name.endswith("poses") else ACTION
         key = "poses" if kind == THROUGH else "pose"
         goal = {key: poses if poses is not None else ros_goal(), **fields}
@@ -299,14 +305,14 @@ class Client:
             f"{name}/_action/send_goal", f"{kind}_SendGoal", goal_id=id, goal=goal
         )
         if reply.accepted:
-            asking = self.node.call(f"{name}/_action/get_result", f"{kind}_GetResult", goal_id=id)
-            self.results[number] = asyncio.ensure_future(asking)
+            getting = self.node.call(f"{name}/_action/get_result", f"{kind}_GetResult", goal_id=id)
+            self.results[number] = asyncio.ensure_future(getting)
         await self.brain.settle()
         return reply.accepted
 
     async def result(self, number):
-        got = await self.results[number]
-        return got.status, got.result.error_code
+        response = await self.results[number]
+        return response.status, response.result.error_code
 
     async def cancel(self, number):
         info = {"goal_id": {"uuid": np.full(16, number, np.uint8)}}
@@ -330,12 +336,14 @@ async def test_a_client_of_ros_sends_a_goal_follows_it_and_gets_the_result():
         topic = "/navigate_to_pose/_action/feedback"
         ros.node.read(topic, f"{ACTION}_FeedbackMessage")
         assert await ros.send(1)
-        assert ros.brain.asked == [(2.0, 1.0, 0.0, "replace")]
-        await ros.brain.say("active", path=((0.0, 0.0), (2.0, 1.0)), distance_remaining=2.25)
+        assert ros.brain.requests == [(2.0, 1.0, 0.0, "replace")]
+        await ros.brain.publish_task(
+            "active", path=((0.0, 0.0), (2.0, 1.0)), distance_remaining=2.25
+        )
         (message,) = ros.node.received[topic]
         assert message.goal_id.uuid.tolist() == [1] * 16
         assert message.feedback.distance_remaining == 2.25
-        await ros.brain.say("succeeded")
+        await ros.brain.publish_task("succeeded")
         assert await ros.result(1) == (4, 0)
 
 
@@ -343,47 +351,49 @@ async def test_a_client_of_ros_cancels_a_goal():
     async with client() as ros:
         await ros.send(1)
         assert await ros.cancel(1) == (0, 1)
-        assert ros.brain.asked[1:] == [("cancel", "goal-1")]
+        assert ros.brain.requests[1:] == [("cancel", "goal-1")]
         assert await ros.result(1) == (5, 0)
         assert await ros.cancel(1) == (3, 0)
 
 
-async def test_a_new_goal_preempts_the_one_before_which_is_aborted_as_by_nav2():
+async def test_a_new_goal_preempts_the_previous_one_which_is_aborted_as_in_nav2():
     async with client() as ros:
         await ros.send(1)
         await ros.send(2, ros_goal(x=1.5))
         assert await ros.result(1) == (6, 0)
-        assert ros.brain.asked == [(2.0, 1.0, 0.0, "replace"), (1.5, 1.0, 0.0, "replace")]
-        await ros.brain.say("succeeded", "goal-2")
+        assert ros.brain.requests == [(2.0, 1.0, 0.0, "replace"), (1.5, 1.0, 0.0, "replace")]
+        await ros.brain.publish_task("succeeded", "goal-2")
         assert await ros.result(2) == (4, 0)
 
 
-async def test_a_goal_that_is_not_understood_is_aborted_and_does_not_end_the_present_one():
+async def test_an_invalid_goal_is_aborted_and_does_not_end_the_present_one():
     async with client() as ros:
         await ros.send(1)
         await ros.send(2, ros_goal("camera"))
         assert await ros.result(2) == (6, 9002)
-        await ros.brain.say("succeeded")
+        await ros.brain.publish_task("succeeded")
         assert await ros.result(1) == (4, 0)
 
 
-async def test_a_goal_without_a_way_is_aborted_with_the_planners_code():
+async def test_a_goal_without_a_path_is_aborted_with_the_planners_code():
     async with client() as ros:
         ros.brain.refusal = "no way leads to the goal"
         await ros.send(1, ros_goal(x=99.0))
         assert await ros.result(1) == (6, 204)
 
 
-async def test_several_poses_are_driven_and_reject_single_ones_meanwhile():
+async def test_while_several_poses_are_driven_a_single_one_is_rejected():
     async with client() as ros:
         name = "/navigate_through_poses"
         topic = f"{name}/_action/feedback"
         ros.node.read(topic, f"{THROUGH}_FeedbackMessage")
         assert await ros.send(1, [ros_goal(x=1.0), ros_goal(x=2.0)], name)
         assert not await ros.send(2)
-        await ros.brain.say("active", "mission-1", goal=Goal(x=2.0, y=1.0), distance_remaining=0.5)
+        await ros.brain.publish_task(
+            "active", "mission-1", goal=Goal(x=2.0, y=1.0), distance_remaining=0.5
+        )
         assert ros.node.received[topic][0].feedback.number_of_poses_remaining == 1
-        await ros.brain.say("succeeded", "mission-1")
+        await ros.brain.publish_task("succeeded", "mission-1")
         assert await ros.result(1) == (4, 0)
         assert await ros.send(3)
 
@@ -394,5 +404,5 @@ async def test_a_gateway_that_ends_cancels_the_task_of_ros():
         await brain.located()
         ros = Client(brain, RosNode(network, brain.net.clock))
         await ros.send(1)
-    assert brain.asked[1:] == [("cancel", "goal-1")]
+    assert brain.requests[1:] == [("cancel", "goal-1")]
     assert await ros.result(1) == (6, 0)

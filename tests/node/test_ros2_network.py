@@ -4,13 +4,13 @@ import pytest
 
 from gigabrain_drivers.bodies.ros2 import link
 from gigabrain_zenoh.testing.waiting import until
-from tests.node.test_ros2_driver import Bench, made, running
+from tests.node.test_ros2_driver import Bench, options_with, running
 
 WLAN = {"10.9.9.1"}
 
 
-async def joins(bench: Bench) -> bool:
-    """Let 3 s pass; return whether the driver has joined again."""
+async def joins_again(bench: Bench) -> bool:
+    """Advance the clock by 3 s; return whether the driver has joined again."""
     before = bench.driver.link.transport
     for _ in range(30):
         await bench.pass_ms(100)
@@ -24,21 +24,21 @@ async def test_a_driver_without_a_robot_joins_again_in_another_network(
 ) -> None:
     monkeypatch.setattr(link, "outer_addresses", set)
     router = {"router": "tcp/127.0.0.1:7447"} if transport == "rmw_zenoh" else {}
-    async with running(made(transport=transport, **router)) as bench:
+    async with running(options_with(transport=transport, **router)) as bench:
         await bench.robot.die()
-        assert not await joins(bench)
+        assert not await joins_again(bench)
         monkeypatch.setattr(link, "outer_addresses", lambda: WLAN)
-        assert await joins(bench) is joined
-        assert not await joins(bench)
+        assert await joins_again(bench) is joined
+        assert not await joins_again(bench)
         bench.robot.start()
         assert await bench.found_after_ms() <= 500
 
 
-async def test_a_driver_with_a_robot_stays_where_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_a_driver_with_a_robot_does_not_join_again(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(link, "outer_addresses", set)
     async with running() as bench:
         await bench.found_after_ms()
         monkeypatch.setattr(link, "outer_addresses", lambda: WLAN)
-        assert not await joins(bench)
+        assert not await joins_again(bench)
         await bench.robot.die()
-        assert await joins(bench)
+        assert await joins_again(bench)

@@ -17,8 +17,8 @@ from tests.node.ros2_robot import TICK_NS
 from tests.node.test_ros2_topics import diagnosed, driver
 
 
-async def asked(robot, service, reply, topic, kind, **fields):
-    """Publish a pose as RViz does; return the requests that a server of ours gets."""
+async def requests_for(robot, service, reply, topic, kind, **fields):
+    """Publish a pose as RViz does; return the requests that our service `service` receives."""
     requests = []
 
     async def answer(request):
@@ -37,10 +37,10 @@ THERE = {"position": {"x": 2.0, "y": 3.0}, "orientation": {"z": 1.0, "w": 0.0}}
 COVARIANCE = np.diag((0.25, 0.25, 0, 0, 0, 0.07)).ravel()
 
 
-async def test_initialpose_says_where_the_robot_is_and_how_sure_that_is():
+async def test_initialpose_sets_the_pose_with_its_covariance():
     async with driver() as robot:
         guess = {"pose": THERE, "covariance": COVARIANCE}
-        (request,) = await asked(
+        (request,) = await requests_for(
             robot, POSE_SET, PoseReply(ok=True, text="looking"), "/initialpose", GUESS,
             header={"frame_id": "map"}, pose=guess,
         )  # fmt: skip
@@ -68,7 +68,7 @@ async def test_a_goal_pose_that_is_answered_late_may_have_been_accepted(monkeypa
 async def test_goal_pose_is_a_goal_in_map_or_odom():
     async with driver() as robot:
         accepted = GoalReply(ok=True, text="on the way", goal="goal-1")
-        (request,) = await asked(
+        (request,) = await requests_for(
             robot,
             GOAL,
             accepted,
@@ -78,7 +78,7 @@ async def test_goal_pose_is_a_goal_in_map_or_odom():
             pose=THERE,
         )
         assert (request.x, request.y, request.how, request.source) == (2.0, 3.0, "replace", "ros2")
-        await robot.say(POSE, PoseInMap(x=1.0, y=9.0, yaw=0.0, covariance=(0.0,) * 9), basis=2)
+        await robot.publish(POSE, PoseInMap(x=1.0, y=9.0, yaw=0.0, covariance=(0.0,) * 9), basis=2)
         await robot.states(1, pose=(1.0, 0.0, 0.0))
         requests = []
 
@@ -100,13 +100,13 @@ async def test_goal_pose_is_a_goal_in_map_or_odom():
         ("map", {"position": {"x": math.nan}}, "position"),
     ],
 )
-async def test_a_goal_pose_that_cannot_be_is_refused_and_said_on_diagnostics(frame, pose, words):
+async def test_an_invalid_goal_pose_is_refused_and_reported_in_diagnostics(frame, pose, words):
     async with driver() as robot:
         await robot.body()
         robot.read("/diagnostics")
         reply = GoalReply(ok=True, text="on the way", goal="goal-1")
         header = {"frame_id": frame}
-        assert not await asked(
+        assert not await requests_for(
             robot, GOAL, reply, "/goal_pose", POSE_STAMPED, header=header, pose=pose
         )
         level, text = (await diagnosed(robot))["gigabrain: goal_pose"]
@@ -114,7 +114,7 @@ async def test_a_goal_pose_that_cannot_be_is_refused_and_said_on_diagnostics(fra
         assert robot.gateway_bus.problems[0].code == "ros2_goal_pose"
 
 
-async def test_of_many_goals_at_once_the_first_and_the_newest_are_asked_for():
+async def test_of_many_goals_at_once_only_the_first_and_the_newest_are_requested():
     async with driver() as robot:
         requests, go_on = [], asyncio.Event()
 
@@ -135,7 +135,7 @@ async def test_of_many_goals_at_once_the_first_and_the_newest_are_asked_for():
 
 async def test_an_initialpose_in_another_frame_is_refused():
     async with driver() as robot:
-        requests = await asked(
+        requests = await requests_for(
             robot, POSE_SET, PoseReply(ok=True, text=""), "/initialpose", GUESS,
             header={"frame_id": "odom"}, pose={"pose": THERE},
         )  # fmt: skip
@@ -150,17 +150,17 @@ async def test_the_settings_are_parameters_that_cannot_be_set():
     async with driver(Ros2Config(cmd_vel_timeout=0.15, leave_out=("imu",))) as robot:
         await robot.body()
         call = robot.node.call
-        names = (await call("/gigabrain/list_parameters", f"{RCL}/ListParameters")).result.names
-        assert {"use_sim_time", "transport", "domain", "cmd_vel_timeout", "take"} <= set(names)
-        asked = ["use_sim_time", "domain", "cmd_vel_timeout", "transport", "leave_out", "nothing"]
-        found = await call("/gigabrain/get_parameters", f"{RCL}/GetParameters", names=asked)
-        assert [one.type for one in found.values] == [1, 2, 3, 4, 9, 0]
+        listed = (await call("/gigabrain/list_parameters", f"{RCL}/ListParameters")).result.names
+        assert {"use_sim_time", "transport", "domain", "cmd_vel_timeout", "take"} <= set(listed)
+        names = ["use_sim_time", "domain", "cmd_vel_timeout", "transport", "leave_out", "nothing"]
+        found = await call("/gigabrain/get_parameters", f"{RCL}/GetParameters", names=names)
+        assert [each.type for each in found.values] == [1, 2, 3, 4, 9, 0]
         time, domain, timeout, transport, left, _ = found.values
         assert (time.bool_value, domain.integer_value) == (True, 0)
         assert (timeout.double_value, transport.string_value) == (0.15, "rmw_zenoh")
         assert left.string_array_value == ["imu"]
         types = await call(
-            "/gigabrain/get_parameter_types", f"{RCL}/GetParameterTypes", names=asked
+            "/gigabrain/get_parameter_types", f"{RCL}/GetParameterTypes", names=names
         )
         assert list(types.types) == [1, 2, 3, 4, 9, 0]
         about = await call(

@@ -1,4 +1,4 @@
-"""Each topic of the gateway, read by a node of ROS in memory: type, QoS, rate, content."""
+"""Each topic of the gateway, read by a ROS node in memory: type, QoS, rate, content."""
 
 import math
 from contextlib import asynccontextmanager
@@ -90,28 +90,28 @@ class Driver:
         )
         bus.time.boot = samples.BOOT
 
-    async def say(self, topic, message, **about):
+    async def publish(self, topic, message, **about):
         self.bus.time.tick = self.tick
         self.bus.publish(topic, message, **about)
         await self.clock.advance(0)
 
     async def body(self, about=BURGER, *, real=False):
-        await self.say(BODY, samples.body(about, real=real))
+        await self.publish(BODY, samples.body(about, real=real))
 
     async def states(self, count=1, **about):
         for _ in range(count):
             self.tick += 1
             changed = {name: about[name] for name in ("imu", "joints") if name in about}
             plain = {name: value for name, value in about.items() if name not in changed}
-            await self.say(STATE, replace(samples.state(self.tick, **plain), **changed))
+            await self.publish(STATE, replace(samples.state(self.tick, **plain), **changed))
             await self.clock.advance(TICK_NS)
 
     def read(self, topic, qos=None):
-        """Subscribe as ROS tools do, unless with another QoS."""
+        """Subscribe with the QoS of ROS tools, unless `qos` is given."""
         kind, offered = TABLE[topic]
         return self.node.read(topic, kind, qos or offered)
 
-    def got(self, topic):
+    def received(self, topic):
         return self.node.received[topic]
 
 
@@ -141,9 +141,9 @@ SERVED = {
 async def test_services_actions_and_parameters_have_the_names_that_ros_tools_expect():
     async with driver() as robot:
         servers = {
-            one.topic: one.type
-            for one in robot.node.transport.endpoints()
-            if not one.ours and one.kind == "server"
+            each.topic: each.type
+            for each in robot.node.transport.endpoints()
+            if not each.ours and each.kind == "server"
         }
         assert SERVED.items() <= servers.items()
         actions = {"navigate_to_pose", "navigate_through_poses"}
@@ -152,7 +152,7 @@ async def test_services_actions_and_parameters_have_the_names_that_ros_tools_exp
         assert goals | parameters <= set(servers)
 
 
-async def test_a_namespace_is_before_each_topic_and_what_is_left_out_is_not_there():
+async def test_topics_have_the_namespace_and_those_in_leave_out_are_missing():
     config = Ros2Config(namespace="/robot1", leave_out=("scan", "/camera/depth/image_raw"))
     async with driver(config) as robot:
         await robot.body()
@@ -160,8 +160,8 @@ async def test_a_namespace_is_before_each_topic_and_what_is_left_out_is_not_ther
         assert set(robot.node.topics()) == {f"/robot1{topic}" for topic in left}
 
 
-async def everything(robot):
-    """Publish all that the gateway could pass on."""
+async def publish_everything(robot):
+    """Publish every message that the gateway can pass on."""
     await robot.body()
     await robot.states(3)
     for topic, message, name in (
@@ -170,13 +170,13 @@ async def everything(robot):
         (IMAGE, JPEG, "front"), (IMAGE, replace(JPEG, frame_id="rear"), "rear"),
         (DEPTH, DEPTH_PICTURE, "front"), (SAFETY, SafetyState(verdict="ok"), ""),
     ):  # fmt: skip
-        await robot.say(topic, message, name=name)
+        await robot.publish(topic, message, name=name)
     await robot.clock.advance(1_100_000_000)
 
 
-async def test_what_ros_does_not_read_is_neither_received_nor_encoded():
+async def test_topics_without_a_reader_are_neither_received_nor_encoded():
     async with driver() as robot:
-        await everything(robot)
+        await publish_everything(robot)
         assert robot.gateway_bus.counters["published"] == 0
         unread = {"scan", "map", "imu", "task", "image/front", "depth/front", "health/*", "safety"}
         listens = set(robot.gateway_bus.listens)
@@ -184,47 +184,47 @@ async def test_what_ros_does_not_read_is_neither_received_nor_encoded():
 
 
 @pytest.mark.parametrize("topic", TABLE)
-async def test_each_topic_comes_with_its_first_reader_and_ends_with_the_last(topic):
+async def test_a_topic_is_published_from_its_first_reader_until_the_last_leaves(topic):
     async with driver() as robot:
         await robot.body()
         before = sorted(robot.gateway_bus.listens)
         close = robot.read(topic)
         other = robot.read(topic)
-        await everything(robot)
-        count = len(robot.got(topic))
+        await publish_everything(robot)
+        count = len(robot.received(topic))
         assert count >= 2  # one for each reader
         assert robot.gateway_bus.counters["published"] == count / 2
         close()
         assert len(robot.gateway_bus.listens) >= len(before)
         other()
         assert sorted(robot.gateway_bus.listens) == before
-        await everything(robot)
-        assert len(robot.got(topic)) == count
+        await publish_everything(robot)
+        assert len(robot.received(topic)) == count
 
 
 @pytest.mark.parametrize("topic", ["/map", "/tf_static", "/robot_description"])
-async def test_late_readers_get_what_is_kept(topic):
+async def test_late_readers_receive_the_latched_message(topic):
     async with driver() as robot:
-        await everything(robot)
+        await publish_everything(robot)
         robot.read(topic)
         await robot.clock.advance(0)
-        assert len(robot.got(topic)) == 1
+        assert len(robot.received(topic)) == 1
         robot.read(topic)
         await robot.clock.advance(0)
-        assert len(robot.got(topic)) == 2
+        assert len(robot.received(topic)) == 2
 
 
-async def test_what_the_driver_repeats_unchanged_is_published_once():
+async def test_an_unchanged_description_is_published_once():
     async with driver() as robot:
         robot.read("/robot_description")
         for _ in range(5):
             await robot.body()
-        assert len(robot.got("/robot_description")) == 1
+        assert len(robot.received("/robot_description")) == 1
         await robot.body(replace(BURGER, body_height=0.4))
-        assert len(robot.got("/robot_description")) == 2
+        assert len(robot.received("/robot_description")) == 2
 
 
-async def test_odometry_and_transforms_come_with_each_state():
+async def test_odometry_and_transforms_are_published_with_each_state():
     async with driver() as robot:
         await robot.body()
         for topic in ("/odom", "/tf", "/joint_states", "/clock"):
@@ -232,45 +232,47 @@ async def test_odometry_and_transforms_come_with_each_state():
         joints = (Joint(name="wheel_left_joint", position=0.5),)
         await robot.states(50, pose=(1.0, 2.0, 0.0), v=0.2, joints=joints)
         for topic in ("/odom", "/tf", "/joint_states", "/clock"):
-            assert len(robot.got(topic)) == 50
-        odom, tf = robot.got("/odom")[-1], robot.got("/tf")[-1]
+            assert len(robot.received(topic)) == 50
+        odom, tf = robot.received("/odom")[-1], robot.received("/tf")[-1]
         assert odom.pose.pose.position.y == 2.0
-        assert odom.header.stamp == tf.transforms[0].header.stamp == robot.got("/clock")[-1].clock
-        found = [(one.header.frame_id, one.child_frame_id) for one in tf.transforms]
+        assert (
+            odom.header.stamp == tf.transforms[0].header.stamp == robot.received("/clock")[-1].clock
+        )
+        found = [(each.header.frame_id, each.child_frame_id) for each in tf.transforms]
         assert found == [("odom", "base_footprint"), ("base_link", "wheel_left_link")]
         assert (odom.header.stamp.sec, odom.header.stamp.nanosec) == (1_000_000_000, 980_000_000)
 
 
-async def test_tf_has_the_map_once_the_robot_is_localized_and_while_it_is():
+async def test_tf_has_the_map_only_while_the_robot_is_localized():
     async with driver() as robot:
         robot.read("/tf")
         await robot.states(2, pose=(1.0, 0.0, 0.0))
         there = PoseInMap(x=5.0, y=5.0, yaw=math.pi / 2, covariance=(0.0,) * 9)
-        await robot.say(POSE, there, basis=2)
+        await robot.publish(POSE, there, basis=2)
         await robot.states(1, pose=(2.0, 0.0, 0.0))
-        in_map, in_odom = robot.got("/tf")[-1].transforms
+        in_map, in_odom = robot.received("/tf")[-1].transforms
         assert (in_map.header.frame_id, in_map.child_frame_id) == ("map", "odom")
         assert (in_odom.header.frame_id, in_odom.child_frame_id) == ("odom", "base_footprint")
         at = in_map.transform
         assert (at.translation.x, at.translation.y) == pytest.approx((5.0, 4.0))
         assert (at.rotation.z, at.rotation.w) == pytest.approx((0.70710678, 0.70710678))
-        await robot.say(POSE, replace(there, localized=False), basis=3)
+        await robot.publish(POSE, replace(there, localized=False), basis=3)
         await robot.states(1)
-        assert len(robot.got("/tf")[-1].transforms) == 1
+        assert len(robot.received("/tf")[-1].transforms) == 1
 
 
-async def test_a_place_in_the_map_that_is_old_is_no_transform():
+async def test_an_old_pose_in_the_map_is_not_published_as_a_transform():
     async with driver() as robot:
         robot.read("/tf")
         await robot.states(2)
-        await robot.say(POSE, PoseInMap(x=0.0, y=0.0, yaw=0.0, covariance=(0.0,) * 9), basis=2)
+        await robot.publish(POSE, PoseInMap(x=0.0, y=0.0, yaw=0.0, covariance=(0.0,) * 9), basis=2)
         await robot.states(1)
-        assert len(robot.got("/tf")[-1].transforms) == 2
+        assert len(robot.received("/tf")[-1].transforms) == 2
         await robot.states(60)
-        assert len(robot.got("/tf")[-1].transforms) == 1
+        assert len(robot.received("/tf")[-1].transforms) == 1
 
 
-async def test_an_imu_stream_goes_before_the_readings_in_states():
+async def test_an_imu_stream_replaces_the_readings_in_states():
     async with driver() as robot:
         robot.read("/imu")
         data = ImuData(
@@ -279,19 +281,19 @@ async def test_an_imu_stream_goes_before_the_readings_in_states():
             linear_acceleration=(0.0, 0.0, 9.8),
         )
         await robot.states(3, imu=data)
-        assert len(robot.got("/imu")) == 3
+        assert len(robot.received("/imu")) == 3
         for _ in range(10):
-            await robot.say(IMU, READING)
+            await robot.publish(IMU, READING)
             await robot.states(1, imu=data)
-        assert [one.linear_acceleration.x for one in robot.got("/imu")[3:]] == [1.0] * 10
+        assert [each.linear_acceleration.x for each in robot.received("/imu")[3:]] == [1.0] * 10
 
 
-async def test_a_battery_comes_once_a_second():
+async def test_the_battery_is_published_once_a_second():
     async with driver() as robot:
         robot.read("/battery_state")
         await robot.states(150, battery=40.0)
-        assert len(robot.got("/battery_state")) == 3
-        assert robot.got("/battery_state")[-1].percentage == pytest.approx(0.4)
+        assert len(robot.received("/battery_state")) == 3
+        assert robot.received("/battery_state")[-1].percentage == pytest.approx(0.4)
 
 
 async def test_pictures_have_the_stamp_of_their_camera_info():
@@ -300,32 +302,32 @@ async def test_pictures_have_the_stamp_of_their_camera_info():
         for topic in ("/camera/image/compressed", "/camera/camera_info", "/camera/depth/image_raw",
                       "/camera/depth/camera_info", "/camera/rear/camera_info"):  # fmt: skip
             robot.read(topic)
-        await robot.say(IMAGE, JPEG, name="front", stamp_ns=5_000_000_007)
-        await robot.say(DEPTH, DEPTH_PICTURE, name="front", stamp_ns=6_000_000_008)
+        await robot.publish(IMAGE, JPEG, name="front", stamp_ns=5_000_000_007)
+        await robot.publish(DEPTH, DEPTH_PICTURE, name="front", stamp_ns=6_000_000_008)
         (picture,), (about,) = (
-            robot.got("/camera/image/compressed"),
-            robot.got("/camera/camera_info"),
+            robot.received("/camera/image/compressed"),
+            robot.received("/camera/camera_info"),
         )
         assert (picture.header.stamp.sec, picture.header.stamp.nanosec) == (5, 7)
         assert picture.header == about.header
         assert picture.data.tobytes() == JPEG.data
-        (depth,) = robot.got("/camera/depth/image_raw")
-        assert depth.header == robot.got("/camera/depth/camera_info")[0].header
+        (depth,) = robot.received("/camera/depth/image_raw")
+        assert depth.header == robot.received("/camera/depth/camera_info")[0].header
         assert depth.header.stamp.sec == 6
         assert depth.data[:2].tolist() == [238, 2]  # 750 mm
-        assert robot.got("/camera/rear/camera_info") == []
+        assert robot.received("/camera/rear/camera_info") == []
 
 
-async def test_depth_that_cannot_be_unpacked_is_left_out_and_counted():
+async def test_malformed_depth_is_dropped_and_counted():
     async with driver() as robot:
         await robot.body()
         robot.read("/camera/depth/image_raw")
         broken = replace(DEPTH_PICTURE, planes=(b"broken",) * 4)
-        await robot.say(DEPTH, broken, name="front")
-        assert robot.got("/camera/depth/image_raw") == []
+        await robot.publish(DEPTH, broken, name="front")
+        assert robot.received("/camera/depth/image_raw") == []
         assert robot.gateway_bus.counters["not_converted"] == 1
-        await robot.say(DEPTH, DEPTH_PICTURE, name="front")
-        assert len(robot.got("/camera/depth/image_raw")) == 1
+        await robot.publish(DEPTH, DEPTH_PICTURE, name="front")
+        assert len(robot.received("/camera/depth/image_raw")) == 1
 
 
 async def test_topics_of_cameras_follow_the_body():
@@ -341,12 +343,14 @@ async def test_topics_of_cameras_follow_the_body():
         assert set(robot.node.topics()) == plain
 
 
-async def test_a_camera_whose_name_the_first_one_has_topics_of_is_apart():
+async def test_a_camera_whose_topics_would_clash_with_the_first_one_gets_others():
     names = ("depth", "image", "depth_camera")
     further = tuple(Camera(name=name, width=16, height=16, depth=True) for name in names)
     async with driver() as robot:
         await robot.body(replace(BURGER, cameras=(CAMERAS[0], *further)))
-        topics = [one.topic for one in robot.node.transport.endpoints() if one.kind == "publisher"]
+        topics = [
+            each.topic for each in robot.node.transport.endpoints() if each.kind == "publisher"
+        ]
         assert len(topics) == len(set(topics))
         cameras = {topic.rpartition("/camera_info")[0] for topic in topics if "info" in topic}
         apart = ("", "/depth_camera_", "/image_camera", "/depth_camera")
@@ -358,8 +362,8 @@ async def test_a_path_ends_with_an_empty_one():
         robot.read("/plan")
         moving = TaskStatus(path=((0.0, 0.0), (1.0, 0.0)), goal=Goal(x=1.0, y=0.0))
         for status in (TaskStatus(), moving, moving, TaskStatus(), TaskStatus()):
-            await robot.say(TASK, status)
-        assert [len(one.poses) for one in robot.got("/plan")] == [0, 2, 2, 0]
+            await robot.publish(TASK, status)
+        assert [len(each.poses) for each in robot.received("/plan")] == [0, 2, 2, 0]
 
 
 HEALTHY = Health(process="perception", pid=7, host="robot", uptime_s=5, cpu=0.2, rss_bytes=10**8,
@@ -367,11 +371,11 @@ HEALTHY = Health(process="perception", pid=7, host="robot", uptime_s=5, cpu=0.2,
 
 
 async def diagnosed(robot):
-    """Return the newest diagnostics by name: level and text."""
+    """Return (level, text) of the newest diagnostics by name."""
     await robot.states(60)
-    statuses = robot.got("/diagnostics")[-1].status
-    assert {one.hardware_id for one in statuses} == {"waffle"}
-    return {one.name: (one.level, one.message) for one in statuses}
+    statuses = robot.received("/diagnostics")[-1].status
+    assert {each.hardware_id for each in statuses} == {"waffle"}
+    return {each.name: (each.level, each.message) for each in statuses}
 
 
 async def test_diagnostics_have_levels_of_gate_safety_battery_and_processes():
@@ -379,11 +383,11 @@ async def test_diagnostics_have_levels_of_gate_safety_battery_and_processes():
         await robot.body()
         robot.read("/diagnostics")
         problem = Cause(code="x", text="no map", remedy="save one")
-        await robot.say(HEALTH, HEALTHY, name="perception")
-        await robot.say(HEALTH, replace(HEALTHY, process="decision", problems=(problem,)),
+        await robot.publish(HEALTH, HEALTHY, name="perception")
+        await robot.publish(HEALTH, replace(HEALTHY, process="decision", problems=(problem,)),
                         name="decision")  # fmt: skip
         await robot.states(1)
-        await robot.say(SAFETY, SafetyState(verdict="slow", causes=(problem,)))
+        await robot.publish(SAFETY, SafetyState(verdict="slow", causes=(problem,)))
         found = await diagnosed(robot)
         assert found["gigabrain: gate"] == (0, "enabled control")
         assert found["gigabrain: safety"][0] == 3  # stale: the verdict is older than a second
@@ -400,17 +404,19 @@ async def test_diagnostics_of_a_silent_robot_are_stale():
         await robot.body()
         robot.read("/diagnostics")
         await robot.clock.advance(2_000_000_000)
-        statuses = {one.name: one for one in robot.got("/diagnostics")[-1].status}
+        statuses = {each.name: each for each in robot.received("/diagnostics")[-1].status}
         assert statuses["gigabrain: gate"].level == 3
         assert "driver" in statuses["gigabrain: gate"].message
 
 
-async def test_a_place_is_composed_of_the_poses_of_its_tick():
+async def test_a_pose_is_composed_from_the_poses_of_its_tick():
     async with driver() as robot:
         robot.read("/tf")
         await robot.states(1, pose=(0.0, 0.0, 0.0))
         await robot.states(1, pose=(1.0, 0.0, 0.0))
         here = PoseInMap(x=0.0, y=0.0, yaw=0.0, covariance=(0.0,) * 9)
-        await robot.say(POSE, here, basis=3)  # before the state of its tick
+        await robot.publish(POSE, here, basis=3)  # before the state of its tick
         await robot.states(1, pose=(3.0, 0.0, 0.0))
-        assert robot.got("/tf")[-1].transforms[0].transform.translation.x == pytest.approx(-3.0)
+        assert robot.received("/tf")[-1].transforms[0].transform.translation.x == pytest.approx(
+            -3.0
+        )
