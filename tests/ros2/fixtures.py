@@ -1,4 +1,4 @@
-"""Fixtures with real ROS 2, for the `conftest.py` of folders whose tests need it."""
+"""Fixtures with real ROS 2, to be imported by a `conftest.py`."""
 
 import os
 from collections.abc import Iterator
@@ -12,9 +12,9 @@ from tests.ros2.judge import Judge, judging
 
 @pytest.fixture(scope="session")
 def ros2() -> Path:
-    """Build the environment with ROS 2 where it is missing; return its interpreter.
+    """Build the environment with ROS 2 if it is missing; return its interpreter.
 
-    Where it cannot be built the tests are skipped, but in CI they fail.
+    If it cannot be built, the tests are skipped; in CI they fail.
     """
     try:
         return build()
@@ -26,14 +26,14 @@ def ros2() -> Path:
 
 @pytest.fixture
 def judge(ros2: Path, tmp_path: Path) -> Iterator[Judge]:
-    """Real ROS 2 in a domain of its own."""
+    """Real ROS 2 in a domain for one test."""
     (folder := tmp_path / "ros2").mkdir()
-    with judging(ros2, folder) as made:
-        yield made
+    with judging(ros2, folder) as judge:
+        yield judge
 
 
 @pytest.fixture(scope="module")
 def shared_judge(ros2: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Judge]:
     """Real ROS 2 in a domain that the tests of a module share."""
-    with judging(ros2, tmp_path_factory.mktemp("ros2")) as made:
-        yield made
+    with judging(ros2, tmp_path_factory.mktemp("ros2")) as judge:
+        yield judge

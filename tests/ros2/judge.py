@@ -1,7 +1,7 @@
-"""Real ROS 2 as a judge: rclpy programs in processes of their own, in a domain of their own.
+"""Real ROS 2 as a judge: rclpy programs, each in its own process, in a free domain.
 
-A program (`tests/ros2/programs`) takes commands and reports events by lines of JSON. ROS finds
-others on this machine only, over UDP, so that a killed program leaves nothing in shared memory.
+A program (`tests/ros2/programs`) reads commands and prints events as lines of JSON. Its discovery
+is limited to this machine. It uses UDP, so that a killed program leaves nothing in shared memory.
 """
 
 import asyncio
@@ -25,16 +25,16 @@ from gigabrain_zenoh.ros2.rtps_discovery import multicast_port, participant_port
 from gigabrain_zenoh.testing.waiting import PATIENCE_S
 from tests.places import ROOT
 
-DOMAINS = range(1, 100)  # their ports lie below those that Linux gives to clients
-OF_USER = ("HOME", "LANG", "TMPDIR", "TZ")  # variables that programs keep
-LONGEST_END_S = 10.0  # of a program whose stdin has ended, on a busy machine
-NOT_KNOWN_YET = "_NODE_NAME_UNKNOWN_"  # of an endpoint whose participant is known later
+DOMAINS = range(1, 100)  # with ports below Linux's ephemeral ones
+USER_VARIABLES = ("HOME", "LANG", "TMPDIR", "TZ")  # passed to programs
+END_TIMEOUT_S = 10.0  # for a program after the end of its stdin, on a busy machine
+UNKNOWN_NODE = "_NODE_NAME_UNKNOWN_"  # of an endpoint while its participant is not known
 POLL_S = 0.005
 Event = dict[str, Any]
 
 
 class Ended(Exception):
-    """A program has ended while something was awaited from it."""
+    """Raised if a program ends before an awaited event."""
 
 
 class Program:
@@ -46,7 +46,7 @@ class Program:
         self._events: list[Event] = []
         self._changed = threading.Condition()
         self._numbers = itertools.count()
-        self._over = False
+        self._ended = False
         with errors.open("wb") as file:
             self._process = subprocess.Popen(
                 command,
@@ -69,17 +69,17 @@ class Program:
                 self._events.append(json.loads(line))
                 self._changed.notify_all()
         with self._changed:
-            self._over = True
+            self._ended = True
             self._changed.notify_all()
 
     @property
     def running(self) -> bool:
-        """True until it has ended."""
+        """True until the program ends."""
         return self._process.poll() is None
 
     @property
     def errors(self) -> str:
-        """Return the text that it has written to standard error."""
+        """The text that the program has written to standard error."""
         return self._errors.read_text()
 
     def send(self, do: str, **fields: Any) -> int:
@@ -101,7 +101,7 @@ class Program:
         within_s: float = PATIENCE_S,
         **fields: Any,
     ) -> Event:
-        """Ask again and again until the answer fits, and return that one."""
+        """Repeat a command until `fits` accepts its answer, and return that answer."""
         end_s = time.monotonic() + within_s
         while not fits(answer := self.ask(do, **fields)):
             if time.monotonic() > end_s:
@@ -110,72 +110,72 @@ class Program:
         return answer
 
     def seen(self, event: str, **like: Any) -> list[Event]:
-        """Return the events so far, with the given fields, in their order."""
+        """Return the events so far that have the given fields, in order."""
         with self._changed:
-            return [one for one in self._events if _fits(one, event, like)]
+            return [each for each in self._events if _matches(each, event, like)]
 
     def wait(self, event: str, within_s: float = PATIENCE_S, nth: int = 0, **like: Any) -> Event:
-        """Wait for the `nth` event with these fields, counted from 0 since the program began.
+        """Wait for the event number `nth` with these fields, counted from 0 since the start.
 
         Raises:
-            Ended: The program ends before.
-            TimeoutError: It does not come.
+            Ended: The program ended first.
+            TimeoutError: There was no such event in time.
         """
 
         def found() -> Event | None:
-            fitting = [one for one in self._events if _fits(one, event, like)]
-            return fitting[nth] if len(fitting) > nth else None
+            matching = [each for each in self._events if _matches(each, event, like)]
+            return matching[nth] if len(matching) > nth else None
 
         with self._changed:
-            if not self._changed.wait_for(lambda: self._over or found(), within_s):
+            if not self._changed.wait_for(lambda: self._ended or found(), within_s):
                 raise TimeoutError(f"{self.name}: no {event} {like} within {within_s:g} s")
-            if one := found():
-                return one
-        code = self._process.wait(LONGEST_END_S)
+            if event_found := found():
+                return event_found
+        code = self._process.wait(END_TIMEOUT_S)
         last = self.errors.strip().rpartition("\n")[2]
         raise Ended(f"{self.name} ended with exit code {code} before {event} {like}: {last}")
 
-    async def hear(
+    async def wait_async(
         self, event: str, within_s: float = PATIENCE_S, nth: int = 0, **like: Any
     ) -> Event:
-        """Wait as `wait` does, while the event loop goes on."""
+        """Like `wait`, without blocking the event loop."""
         return await asyncio.to_thread(self.wait, event, within_s, nth, **like)
 
     async def query(self, do: str, **fields: Any) -> Event:
-        """Send a command and return its answer, while the event loop goes on."""
-        return await self.hear(do, id=self.send(do, **fields))
+        """Like `ask`, without blocking the event loop."""
+        return await self.wait_async(do, id=self.send(do, **fields))
 
     async def available(self, **where: Any) -> None:
-        """Wait until the program finds the server of a service or action, as its users must.
+        """Wait until the program finds the server of a service or action.
 
-        What is sent before is lost.
+        A request that is sent earlier is lost.
         """
         await asyncio.to_thread(self.poll, "available", lambda one: one["available"], **where)
 
     async def endpoints(self, topic: str) -> Event:
-        """Return who publishes and subscribes, once ROS knows the names of their nodes."""
+        """Return the publishers and subscribers, once ROS knows the names of their nodes."""
 
         def named(found: Event) -> bool:
             ends = [*found["publishers"], *found["subscribers"]]
-            return all(end["node"] != NOT_KNOWN_YET for end in ends)
+            return all(end["node"] != UNKNOWN_NODE for end in ends)
 
         return await asyncio.to_thread(self.poll, "endpoints", named, topic=topic)
 
     def kill(self) -> int:
-        """End it at once, as `kill -9` does; returns the monotonic time [ns] of the signal."""
+        """Kill the program by SIGKILL; return the monotonic time [ns] of the signal."""
         self._process.kill()
         killed_ns = time.monotonic_ns()
-        self._process.wait(LONGEST_END_S)
+        self._process.wait(END_TIMEOUT_S)
         return killed_ns
 
     @contextmanager
     def frozen(self) -> Iterator[None]:
-        """Stop it by SIGSTOP, and let it go on afterwards."""
+        """Stop the program by SIGSTOP, and continue it at the end of the context."""
         with frozen(self.pid):
             yield
 
     def end(self) -> None:
-        """Ask it to end, as its user would, without waiting for that."""
+        """Close stdin, so that the program ends, without waiting for its end."""
         assert self._process.stdin
         with suppress(ProcessLookupError):
             os.killpg(self.pid, signal.SIGCONT)
@@ -183,23 +183,23 @@ class Program:
             self._process.stdin.close()
 
     def close(self) -> None:
-        """End it as its user would, and by force where that does not help."""
+        """End the program, by force if closing its stdin does not help."""
         self.end()
         with suppress(subprocess.TimeoutExpired):
-            self._process.wait(LONGEST_END_S)
-        with suppress(ProcessLookupError):  # it, where it still runs, and what it has started
+            self._process.wait(END_TIMEOUT_S)
+        with suppress(ProcessLookupError):  # the program, if it still runs, and its children
             os.killpg(self.pid, signal.SIGKILL)
-        self._process.wait(LONGEST_END_S)
-        self._reader.join(LONGEST_END_S)
+        self._process.wait(END_TIMEOUT_S)
+        self._reader.join(END_TIMEOUT_S)
         assert self._process.stdout
         self._process.stdout.close()
 
 
 class Judge:
-    """Starts rclpy programs in one domain, and ends them."""
+    """Starts and ends rclpy programs in one domain."""
 
     def __init__(self, python: Path, domain: int, folder: Path) -> None:
-        """Use the interpreter of an environment with ROS 2; logs go to `folder`."""
+        """`python` is the interpreter of an environment with ROS 2; logs go to `folder`."""
         self.domain = domain
         self._python, self._folder = python, folder
         self._programs: list[Program] = []
@@ -207,7 +207,7 @@ class Judge:
     def start(
         self, program: str, node: str = "judge", namespace: str = "/", **settings: Any
     ) -> Program:
-        """Start one of the programs, with a node of that name, and wait until it is ready."""
+        """Start a program with a node of the given name, and wait until it is ready."""
         name = f"{program}-{len(self._programs)}"
         words = json.dumps({"node": node, "namespace": namespace} | settings)
         command = [str(self._python), "-m", f"tests.ros2.programs.{program}", words]
@@ -217,8 +217,8 @@ class Judge:
         return started
 
     def environment(self) -> dict[str, str]:
-        """Return the variables of a program of ROS in this domain."""
-        return {name: os.environ[name] for name in OF_USER if name in os.environ} | {
+        """Return the environment variables of a ROS program in this domain."""
+        return {name: os.environ[name] for name in USER_VARIABLES if name in os.environ} | {
             "PATH": f"{self._python.parent}:/usr/bin:/bin",
             "ROS_DOMAIN_ID": str(self.domain),
             "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
@@ -237,7 +237,7 @@ class Judge:
 
 @contextmanager
 def judging(python: Path, folder: Path) -> Iterator[Judge]:
-    """Start and end a judge in a free domain, with the interpreter of an environment."""
+    """Yield a judge in a free domain; end its programs at the end of the context."""
     with free_domain() as domain, ExitStack() as stack:
         judge = Judge(python, domain, folder)
         stack.callback(judge.close)
@@ -246,7 +246,7 @@ def judging(python: Path, folder: Path) -> Iterator[Judge]:
 
 @contextmanager
 def free_domain() -> Iterator[int]:
-    """Claim a domain that nobody uses: by a lock among tests, and by its ports among all."""
+    """Yield an unused domain: no test has locked it, and all its ports are free."""
     folder = Path(tempfile.gettempdir()) / f"gigabrain-ros2-{os.getuid()}"
     folder.mkdir(exist_ok=True)
     for domain in random.sample(DOMAINS, len(DOMAINS)):
@@ -262,7 +262,7 @@ def free_domain() -> Iterator[int]:
 
 
 def is_free(domain: int) -> bool:
-    """Return whether no participant of DDS uses a domain on this machine."""
+    """Return whether no DDS participant uses a domain on this machine."""
     ports = itertools.chain.from_iterable(participant_ports(domain, each) for each in range(120))
     for port in (multicast_port(domain), *ports):
         with socket.socket(type=socket.SOCK_DGRAM) as probe:
@@ -275,10 +275,10 @@ def is_free(domain: int) -> bool:
 
 @contextmanager
 def frozen(pid: int) -> Iterator[None]:
-    """Stop a process by SIGSTOP, and let it go on afterwards."""
+    """Stop a process by SIGSTOP, and continue it at the end of the context."""
     os.kill(pid, signal.SIGSTOP)
     try:
-        while _state(pid) != "T":  # the signal takes effect a little later
+        while _process_state(pid) != "T":  # the signal takes effect a little later
             time.sleep(POLL_S)
         yield
     finally:
@@ -286,10 +286,10 @@ def frozen(pid: int) -> Iterator[None]:
             os.kill(pid, signal.SIGCONT)
 
 
-def _state(pid: int) -> str:
-    """Return the letter of a process in /proc."""
+def _process_state(pid: int) -> str:
+    """Return the state letter of a process in /proc."""
     return Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0]
 
 
-def _fits(event: Event, name: str, like: dict[str, Any]) -> bool:
+def _matches(event: Event, name: str, like: dict[str, Any]) -> bool:
     return event["event"] == name and all(event.get(key) == like[key] for key in like)

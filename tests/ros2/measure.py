@@ -1,7 +1,7 @@
 """Measures a simulated robot with its gateway against real ROS 2: `python -m tests.ros2.measure`.
 
-Times are from events on one machine with one monotonic clock: when rclpy has sent or received, and
-when the robot's state with the effect has arrived here. A busy machine makes all of them longer.
+All times are from the monotonic clock of one machine: when rclpy sent or received a message, and
+when the robot's state with the effect arrived here. A busy machine makes all of them longer.
 """
 
 import asyncio
@@ -43,14 +43,14 @@ from gigabrain_zenoh.ros2.dds import DdsTransport
 from gigabrain_zenoh.ros2.qos import SENSOR_DATA
 from gigabrain_zenoh.ros2.types import Types
 from gigabrain_zenoh.testing.waiting import until
-from tests.ros2.environment import build, say
+from tests.ros2.environment import build, report_progress
 from tests.ros2.judge import Judge, Program, judging
 
 SPEED_MPS, COMMAND_HZ, PAUSE_S, TRY_S = 0.15, 20.0, 1.0, 10.0
 SET_BOOL, NAVIGATE = "std_srvs/srv/SetBool", "nav2_msgs/action/NavigateToPose"
 ACTION = {"action": "/navigate_to_pose", "type": NAVIGATE}
 GOAL_S = 300.0
-MAX_RESTARTS = 4  # of five deaths within a minute, the supervisor gives a process up
+MAX_RESTARTS = 4  # after five deaths within a minute, the supervisor gives up
 READ = {
     "/scan": ("sensor_msgs/msg/LaserScan", {"reliable": False}),
     "/odom": ("nav_msgs/msg/Odometry", {}),
@@ -61,19 +61,19 @@ app = App(result_action="return_value")
 
 
 class Robot:
-    """A running robot, with the times [ns] at which its states and scans have arrived."""
+    """A running robot, with the arrival times [ns] of its states and scans."""
 
     def __init__(self, group: ProcessGroup, bus: Bus) -> None:
         self.group, self.bus = group, bus
         self.states: list[tuple[int, RobotState]] = []
-        self.scans: dict[int, int] = {}  # by the stamp
-        bus.subscribe(STATE, self._take_state)
-        bus.subscribe(SCAN, self._take_scan)
+        self.scans: dict[int, int] = {}  # arrival times by stamp
+        bus.subscribe(STATE, self._on_state)
+        bus.subscribe(SCAN, self._on_scan)
 
-    def _take_state(self, _key: str, state: RobotState) -> None:
+    def _on_state(self, _key: str, state: RobotState) -> None:
         self.states.append((time.monotonic_ns(), state))
 
-    def _take_scan(self, _key: str, scan: LaserScan) -> None:
+    def _on_scan(self, _key: str, scan: LaserScan) -> None:
         self.scans[scan.stamp_ns] = time.monotonic_ns()
 
     @property
@@ -82,24 +82,24 @@ class Robot:
         return self.states[-1][1]
 
     def stopped_ns(self, since_ns: int) -> int | None:
-        """Return when the first state with a command of zero arrived after `since_ns`."""
-        later = ((at, one) for at, one in self.states if at > since_ns)
-        return next((at for at, one in later if one.sent.linear_x == 0.0), None)
+        """Return the arrival time of the first state with a zero command after `since_ns`."""
+        later = ((at, state) for at, state in self.states if at > since_ns)
+        return next((at for at, state in later if state.sent.linear_x == 0.0), None)
 
     def braked_ns(self, since_ns: int) -> int | None:
-        """Return when the first state with a lower command than before arrived after `since_ns`."""
-        later = [(at, one.sent.linear_x) for at, one in self.states if at > since_ns]
+        """Return the arrival time of the first state with a reduced command after `since_ns`."""
+        later = [(at, state.sent.linear_x) for at, state in self.states if at > since_ns]
         return next((at for (_, was), (at, now) in pairwise(later) if now < was), None)
 
     async def released(self) -> None:
-        """Release the robot, once it has rested as long as that takes."""
+        """Release the robot, as soon as it has been at rest for long enough."""
         while self.now.gate.mode == "latched":
             with contextlib.suppress(Refused, BodyLost):
                 await release(self.bus, self.now.gate.estop_generation)
             await asyncio.sleep(0.1)
 
     async def driven(self, driver: Program) -> None:
-        """Let ROS drive; on a busy machine the gate may stop it, and it has to pause."""
+        """Let ROS drive; if the gate of a busy machine stops it, pause and try again."""
         while True:
             await self.released()
             await driver.query("drive", linear=SPEED_MPS, angular=0.5, hz=COMMAND_HZ)
@@ -123,11 +123,11 @@ async def running(judge: Judge, world: str, **parts: Any) -> AsyncIterator[Robot
 
 
 async def arrivals(judge: Judge, topic: str, count: int) -> dict[int, int]:
-    """Return when [ns] scans have arrived at rclpy, ten for each of `count`, by their stamps."""
+    """Return the arrival times [ns] of 10 * `count` scans at rclpy, by their stamps."""
     listen = judge.start("listen")
     kind, qos = READ["/scan"]
     await listen.query("subscribe", topic=topic, type=kind, qos=qos, stream=True)
-    await listen.hear("message", GOAL_S, nth=10 * count + 5)
+    await listen.wait_async("message", GOAL_S, nth=10 * count + 5)
     found = {}
     for event in listen.seen("message", topic=topic)[5:]:
         stamp = event["value"]["header"]["stamp"]
@@ -137,17 +137,17 @@ async def arrivals(judge: Judge, topic: str, count: int) -> dict[int, int]:
 
 
 def later(arrived: dict[int, int], than: dict[int, int]) -> list[float]:
-    """Return how much later [ms] scans have arrived."""
+    """Return the delays [ms] of scans in `arrived` against those in `than`."""
     return [(at_ns - than[stamp]) / 1e6 for stamp, at_ns in arrived.items() if stamp in than]
 
 
 async def added_latency(robot: Robot, judge: Judge, count: int) -> list[float]:
-    """Return by how much later [ms] scans arrive at rclpy than at a process on our bus."""
+    """Return the delays [ms] of scans at rclpy against their arrival on our bus."""
     return later(await arrivals(judge, "/scan", count), robot.scans)
 
 
 async def bare_hops(robot: Robot, judge: Judge, count: int) -> list[float]:
-    """Return the times [ms] of scans that this process writes to DDS itself, until rclpy."""
+    """Return the times [ms] from writing scans to DDS in this process to rclpy."""
     link = Ros2Link(node="bare", transport="dds", domain=judge.domain, localhost=True)
     written: dict[int, int] = {}
     async with DdsTransport(link, Types()) as ros:
@@ -165,36 +165,36 @@ async def bare_hops(robot: Robot, judge: Judge, count: int) -> list[float]:
 
 
 async def late_joins(robot: Robot, judge: Judge, count: int) -> list[float]:
-    """Return the times [ms] from the subscription of a node that has just come to a message."""
+    """Return the times [ms] from the subscription of a new node to its first message."""
     found = []
     kind, qos = READ["/odom"]
     for _ in range(count):
         listen = judge.start("listen")
         asked = await listen.query("subscribe", topic="/odom", type=kind, qos=qos, stream=True)
-        found.append(((await listen.hear("message"))["at_ns"] - asked["at_ns"]) / 1e6)
+        found.append(((await listen.wait_async("message"))["at_ns"] - asked["at_ns"]) / 1e6)
         listen.close()
     return found
 
 
 async def restarts(robot: Robot, judge: Judge, count: int) -> list[float]:
-    """Return the times [ms] from the gateway's death until rclpy reads its successor."""
+    """Return the times [ms] from killing the gateway to the first message of its successor."""
     listen, found = judge.start("listen"), []
     kind, qos = READ["/odom"]
     await listen.query("subscribe", topic="/odom", type=kind, qos=qos, stream=True)
     for _ in range(min(count, MAX_RESTARTS)):
-        await listen.hear("message", nth=len(listen.seen("message")))
+        await listen.wait_async("message", nth=len(listen.seen("message")))
         before = robot.group.pids["ros2"]
         os.kill(before, signal.SIGKILL)
         killed_ns = time.monotonic_ns()
         await until(lambda pid=before: robot.group.pids.get("ros2", pid) != pid, "its successor")
-        first = await listen.hear("message", nth=len(listen.seen("message")))
+        first = await listen.wait_async("message", nth=len(listen.seen("message")))
         found.append((first["at_ns"] - killed_ns) / 1e6)
     listen.close()
     return found
 
 
 async def brakings(robot: Robot, judge: Judge, count: int) -> list[float]:
-    """Return the times [ms] from the period after a killed publisher's last command to braking."""
+    """Return the times [ms] from one period after a killed publisher's last command to braking."""
     found = []
     for _ in range(count):
         driver = judge.start("drive")
@@ -208,7 +208,7 @@ async def brakings(robot: Robot, judge: Judge, count: int) -> list[float]:
 
 
 async def stops(robot: Robot, judge: Judge, count: int) -> list[float]:
-    """Return the times [ms] from a call of /estop to a command of zero, while it drives."""
+    """Return the times [ms] from a call of /estop while driving to a zero command."""
     caller, found = judge.start("call"), []
     where = {"service": "/estop", "type": SET_BOOL}
     await caller.available(**where)
@@ -216,7 +216,7 @@ async def stops(robot: Robot, judge: Judge, count: int) -> list[float]:
         driver = judge.start("drive")
         await robot.driven(driver)
         await caller.query("call", **where, name=str(number), data=True)
-        sent_ns = (await caller.hear("response", name=str(number)))["sent_ns"]
+        sent_ns = (await caller.wait_async("response", name=str(number)))["sent_ns"]
         await until(lambda ns=sent_ns: robot.stopped_ns(ns), "stopping")
         found.append(((robot.stopped_ns(sent_ns) or 0) - sent_ns) / 1e6)
         driver.close()
@@ -225,11 +225,11 @@ async def stops(robot: Robot, judge: Judge, count: int) -> list[float]:
 
 
 async def load(robot: Robot, judge: Judge, seconds: float) -> tuple[float, dict[str, float]]:
-    """Return the gateway's share of a core [%], and the rates [Hz] at which rclpy reads."""
+    """Return the gateway's share of a core [%], and the rates [Hz] of topics at rclpy."""
     listen = judge.start("listen")
     for topic, (kind, qos) in READ.items():
         await listen.query("subscribe", topic=topic, type=kind, qos=qos)
-    await asyncio.to_thread(listen.poll, "report", lambda one: one["count"] > 10, topic="/odom")
+    await asyncio.to_thread(listen.poll, "report", lambda each: each["count"] > 10, topic="/odom")
     process = psutil.Process(robot.group.pids["ros2"])
     times = process.cpu_times()
     began_s = time.monotonic()
@@ -243,37 +243,37 @@ async def load(robot: Robot, judge: Judge, seconds: float) -> tuple[float, dict[
 
 
 class Goals:
-    """Goals that rclpy sends to a robot that has explored its world."""
+    """Sends goals by rclpy to a robot that has explored its world."""
 
     def __init__(self, sender: GoalSender, client: Program) -> None:
         self._sender, self._client = sender, client
 
     async def send(self, name: str) -> None:
-        """Send a goal to a random place; return once it is followed."""
+        """Send a goal to a random place; return at its first feedback."""
         place = await self._sender.random_goal()
         position = {"x": place.x, "y": place.y}
         pose = {"header": {"frame_id": "map"}, "pose": {"position": position}}
         await self._client.query("send", **ACTION, name=name, goal={"pose": pose})
-        await self._client.hear("feedback", name=name)
+        await self._client.wait_async("feedback", name=name)
 
     async def ended(self, name: str) -> tuple[str, int]:
-        """Return how a goal ended, and Nav2's error code."""
-        found = await self._client.hear("result", GOAL_S, name=name)
+        """Wait for the end of a goal; return its status and Nav2's error code."""
+        found = await self._client.wait_async("result", GOAL_S, name=name)
         return found["status"], found["value"]["error_code"]
 
     async def followed(self, name: str) -> bool:
-        """Return whether a goal is reached."""
+        """Send a goal; return whether it is reached."""
         await self.send(name)
         return await self.ended(name) == ("succeeded", 0)
 
     async def cancelled(self, name: str) -> bool:
-        """Return whether a goal ends when it is cancelled."""
+        """Send and cancel a goal; return whether it ends as cancelled."""
         await self.send(name)
         await self._client.query("cancel", name=name)
         return await self.ended(name) == ("canceled", 0)
 
     async def preempted(self, name: str) -> bool:
-        """Return whether a goal ends when the next one comes, which is reached."""
+        """Send two goals; return whether the first is aborted, and the second reached."""
         await self.send(name)
         await self.send(f"{name}, then")
         ends = await self.ended(name), await self.ended(f"{name}, then")
@@ -281,13 +281,13 @@ class Goals:
 
 
 async def goals(judge: Judge, count: int) -> dict[str, tuple[int, int]]:
-    """Return how many goals were followed, cancelled and preempted as wanted, of how many."""
+    """Return (successes, tries) of following, cancelling and preempting goals."""
     brain = {"perception": PerceptionConfig(mapping="slam"), "resume": "auto"}
     brain["decision"] = DecisionConfig(behaviour="navigate")
     async with running(judge, "house", **brain) as robot:
         sender = GoalSender(robot.bus, robot.group, seed=0)
         await until(lambda: sender.is_localized, "a map", START_TIMEOUT_S)
-        say("exploring the house")
+        report_progress("exploring the house")
         await sender.explore()
         client = judge.start("navigate")
         await client.available(**ACTION)
@@ -299,19 +299,19 @@ async def goals(judge: Judge, count: int) -> dict[str, tuple[int, int]]:
         }
         found = {}
         for way, run in ways.items():
-            right = 0
+            successes = 0
             for number in range(count):
-                right += await run(f"{way} {number}")
-                say(f"{way}: {right} of {number + 1}")
-            found[way] = right, count
+                successes += await run(f"{way} {number}")
+                report_progress(f"{way}: {successes} of {number + 1}")
+            found[way] = successes, count
     return found
 
 
 async def times(judge: Judge, count: int, seconds: float) -> Table:
-    """Return the table of times and load."""
+    """Measure times and load; return their table."""
     table = Table("what", "n", "p50", "p99", "longest", title=f"load {os.getloadavg()[0]:.1f}")
     async with running(judge, "arena") as robot:
-        say("measuring rates and load")
+        report_progress("measuring rates and load")
         share, rates = await load(robot, judge, seconds)
         rows: dict[str, Any] = {
             "scan at rclpy, later than on our bus (ms)": added_latency,
@@ -322,10 +322,10 @@ async def times(judge: Judge, count: int, seconds: float) -> Table:
             "gateway killed: until rclpy reads the next one (ms)": restarts,
         }
         for name, measure in rows.items():
-            say(f"measuring: {name}")
+            report_progress(f"measuring: {name}")
             values = sorted(await measure(robot, judge, count))
             shown = (statistics.median(values), percentile(values, 0.99), values[-1])
-            table.add_row(name, str(len(values)), *(f"{one:.1f}" for one in shown if one))
+            table.add_row(name, str(len(values)), *(f"{each:.1f}" for each in shown if each))
     listed = ", ".join(f"{topic} {hz:.1f} Hz" for topic, hz in rates.items())
     table.add_row(f"gateway's share of a core (%); {listed}", "", f"{share:.1f}")
     return table

@@ -1,4 +1,4 @@
-"""ROS nodes of ours on either transport, for tests."""
+"""Our own ROS nodes on either transport, for tests."""
 
 import contextlib
 import functools
@@ -18,12 +18,12 @@ TRIGGER = "std_srvs/srv/Trigger"
 
 @functools.cache
 def types() -> Types:
-    """All types; to load them takes half a second."""
+    """Return all types. Loading them takes half a second."""
     return Types()
 
 
 class Nodes:
-    """Makes nodes that share `shared` of their links, and closes them with its stack."""
+    """Opens nodes with the shared link settings `shared`; its stack closes them."""
 
     def __init__(self, **shared: Any) -> None:
         self.types = types()
@@ -31,12 +31,12 @@ class Nodes:
         self._shared = shared
 
     def opened(self, name: str = "gigabrain", **fields: Any) -> AbstractAsyncContextManager[Any]:
-        """Return a node that is open in a context of its own."""
+        """Return a context in which a node is open."""
         link = Ros2Link(node=name, **(self._shared | fields))
         return open_transport(link, self.types)
 
     async def node(self, name: str = "gigabrain", **fields: Any) -> Any:
-        """Open a node for as long as the test runs."""
+        """Open a node until the end of the test."""
         return await self.stack.enter_async_context(self.opened(name, **fields))
 
     def string(self, data: str) -> bytes:
@@ -58,17 +58,17 @@ class ZenohNodes(Nodes):
 
 @contextlib.asynccontextmanager
 async def zenoh_nodes() -> AsyncIterator[ZenohNodes]:
-    """Nodes over `rmw_zenoh` with a router of their own."""
+    """Nodes over `rmw_zenoh`, with a router for them."""
     async with robot() as net:
         await net.router()
-        made = ZenohNodes(net)
-        async with made.stack:
-            yield made
+        nodes = ZenohNodes(net)
+        async with nodes.stack:
+            yield nodes
 
 
 @contextlib.asynccontextmanager
 async def dds_nodes() -> AsyncIterator[Nodes]:
-    """Nodes over DDS in a domain of this process's own, on the loopback."""
-    made = Nodes(transport="dds", domain=100 + os.getpid() % 100, localhost=True)
-    async with made.stack:
-        yield made
+    """Nodes over DDS on the loopback, in a domain for this process."""
+    nodes = Nodes(transport="dds", domain=100 + os.getpid() % 100, localhost=True)
+    async with nodes.stack:
+        yield nodes

@@ -1,4 +1,4 @@
-// Reads and writes CDR with Foxglove's codec, for lines of JSON on stdin.
+// Decodes and encodes CDR with Foxglove's codec, for lines of JSON on stdin.
 import { createRequire } from "node:module";
 import { createInterface } from "node:readline";
 

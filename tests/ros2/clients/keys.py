@@ -1,4 +1,4 @@
-"""Prints the keys that pamoja-ros2 makes, for the lines of JSON on stdin."""
+"""Prints the keys of pamoja-ros2 for lines of JSON on stdin."""
 
 import json
 import sys

@@ -1,8 +1,8 @@
-"""Open-RMF's side of a robot: what its adapter free_fleet reads and asks, with its own libraries.
+"""Open-RMF's side of a robot: reads and requests the same as the adapter free_fleet.
 
-Written from the source of open-rmf/free_fleet at 002505f. Started as `python open_rmf.py ROBOT
-CONFIG` with a Zenoh configuration. Each line of JSON on stdin names a call, `["navigate", 1, 0]`,
-and one line of JSON on stdout answers it.
+It uses the adapter's libraries, and follows open-rmf/free_fleet at 002505f. Start it by
+`python open_rmf.py ROBOT CONFIG` with a Zenoh configuration. Each line of JSON on stdin is a call,
+such as `["navigate", 1, 0]`, and one line of JSON on stdout answers it.
 """
 
 import json
@@ -78,7 +78,7 @@ class GetResultRequest(IdlStruct):
 
 @dataclass
 class GetResultResponse(IdlStruct):
-    status: int8  # what follows is not read
+    status: int8  # the following fields are not read
 
 
 @dataclass
@@ -137,28 +137,31 @@ class BatteryState(IdlStruct):
 
 
 class Adapter:
-    """Open-RMF's side of one robot: keeps its frames, battery and feedback, and asks it."""
+    """Keeps frames, battery and feedback of one robot, and sends requests to it."""
 
     def __init__(self, session: zenoh.Session, robot: str) -> None:
         self.session, self.robot = session, robot
         self.frames: dict[str, Transform] = {}
         self.charge: float | None = None
-        self.fed: list[Feedback] = []
+        self.received_feedback: list[Feedback] = []
         self.goal_id: list[int] | None = None
         action = "navigate_to_pose/_action"
-        self.kept = [
+        self.subscribers = [
             session.declare_subscriber(f"{robot}/{key}", lambda sample, take=take: take(
                 sample.payload.to_bytes()))
             for key, take in (
                 ("tf", self.on_tf),
                 ("battery_state", self.on_battery),
-                (f"{action}/feedback", lambda data: self.fed.append(Feedback.deserialize(data))),
+                (f"{action}/feedback", self.on_feedback),
             )
         ]  # fmt: skip
 
     def on_tf(self, data: bytes) -> None:
         for each in Transforms.deserialize(data).transforms:
             self.frames[each.child_frame_id] = each
+
+    def on_feedback(self, data: bytes) -> None:
+        self.received_feedback.append(Feedback.deserialize(data))
 
     def on_battery(self, data: bytes) -> None:
         self.charge = BatteryState.deserialize(data).percentage
@@ -191,15 +194,15 @@ class Adapter:
         return self.charge
 
     def feedback(self) -> list[object] | None:
-        """Return frame, way and time that are left, and whether it is of the present goal."""
-        if not self.fed:
+        """Return frame, remaining distance and time, and whether it is of the present goal."""
+        if not self.received_feedback:
             return None
-        last = self.fed[-1]
+        last = self.received_feedback[-1]
         left = last.distance_remaining, last.estimated_time_remaining.sec
         return [last.current_pose.header.frame_id, *left, list(last.goal_id) == self.goal_id]
 
     def navigate(self, x: float, y: float) -> object:
-        """Cancel all goals if there was one, and send a new one; return whether it is accepted."""
+        """Cancel the previous goal, and send a new one; return whether it is accepted."""
         if self.goal_id is not None:
             self.stop()
         self.goal_id = list(os.urandom(16))
@@ -220,7 +223,7 @@ class Adapter:
         return CancelResponse.deserialize(response).return_code if response else error
 
     def garbage(self, name: str, payload: str) -> str:
-        """Return the error that bytes in hexadecimal get."""
+        """Send malformed bytes (hexadecimal); return the error text."""
         return self.ask(name, bytes.fromhex(payload))[1]
 
 

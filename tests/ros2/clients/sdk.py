@@ -1,4 +1,4 @@
-"""A node of zenoh-ros2-sdk that echoes strings, answers a service, and calls one of ours.
+"""A node of zenoh-ros2-sdk that echoes strings, serves a service, and calls one of ours.
 
 Started as `python sdk.py PORT` with a router on the loopback; prints a line of JSON for each event.
 """
@@ -14,7 +14,7 @@ TEXT, REQUEST, RESPONSE = "string data\n", "bool data\n", "bool success\nstring 
 WAIT_S = 60.0
 
 
-def say(**fields: object) -> None:
+def print_event(**fields: object) -> None:
     """Print an event."""
     print(json.dumps(fields), flush=True)
 
@@ -25,22 +25,22 @@ def main() -> None:
     back = ROS2Publisher("/back", STRING, TEXT, **where)
 
     def echo(message: object) -> None:
-        say(got=message.data)
+        print_event(got=message.data)
         back.publish(data=f"re {message.data}")
 
     def answer(request: object) -> object:
         return server.response_msg_class(success=request.data, message="theirs")
 
-    kept = ROS2Subscriber("/chatter", STRING, echo, TEXT, node_name="sdk", **where)
+    subscriber = ROS2Subscriber("/chatter", STRING, echo, TEXT, node_name="sdk", **where)
     server = ROS2ServiceServer("/theirs", SET_BOOL, answer, REQUEST, RESPONSE, **where)
     client = ROS2ServiceClient("/estop", SET_BOOL, REQUEST, RESPONSE, **where)
-    say(ready=True)
+    print_event(ready=True)
     end_s = time.monotonic() + WAIT_S
     while not (response := client.call(data=True)) and time.monotonic() < end_s:
         time.sleep(0.1)
-    say(response=[response.success, response.message] if response else None)
+    print_event(response=[response.success, response.message] if response else None)
     sys.stdin.read()
-    for each in (kept, server, client, back):
+    for each in (subscriber, server, client, back):
         each.close()
 
 

@@ -1,4 +1,7 @@
-"""Calls services of any type. Commands: `wait` for a server, `call`, which times the answer."""
+"""Calls services of any type.
+
+Commands: `available` (whether there is a server), `call` (reports response and duration).
+"""
 
 import time
 from typing import Any
@@ -6,8 +9,8 @@ from typing import Any
 from rclpy.client import Client
 
 from tests.ros2.programs.console import start
+from tests.ros2.programs.events import emit
 from tests.ros2.programs.messages import find, make, to_json
-from tests.ros2.programs.say import say
 
 
 def main() -> None:
@@ -25,11 +28,11 @@ def main() -> None:
 
     def call(service: str, type: str, name: str = "", **request: Any) -> None:
         sent_ns = time.monotonic_ns()
-        answer = client(service, type).call_async(make(find(type).Request, request))
+        future = client(service, type).call_async(make(find(type).Request, request))
 
         def show(done: Any) -> None:
             now_ns = time.monotonic_ns()
-            say(
+            emit(
                 "response",
                 at_ns=now_ns,
                 name=name,
@@ -39,7 +42,7 @@ def main() -> None:
                 value=to_json(done.result()),
             )
 
-        answer.add_done_callback(show)
+        future.add_done_callback(show)
 
     console.commands |= {"available": available, "call": call}
     console.run()

@@ -1,4 +1,4 @@
-"""Serialises and deserialises by ROS itself, and tells its type hashes; needs no network.
+"""Serialises and deserialises by ROS itself, and lists its type hashes; needs no network.
 
 Commands: `hashes` (of all installed types, from their descriptions), `serialize`, `deserialize`.
 """
@@ -10,12 +10,12 @@ from typing import Any
 
 from rclpy.serialization import deserialize_message, serialize_message
 
+from tests.ros2.programs.events import emit
 from tests.ros2.programs.messages import find, make, to_json
-from tests.ros2.programs.say import say
 
 
 def hashes() -> dict[str, Any]:
-    """Return the hash of each installed message, service and action, and of their parts."""
+    """Return the hashes of all installed messages, services and actions, and of their parts."""
     found: dict[str, str] = {}
     for kind in ("msg", "srv", "action"):
         for path in sorted(Path(sys.prefix, "share").glob(f"*/{kind}/*.json")):
@@ -26,23 +26,23 @@ def hashes() -> dict[str, Any]:
 
 
 def serialize(type: str, value: dict[str, Any]) -> dict[str, Any]:
-    """Return a message as ROS serialises it."""
+    """Serialise a message by ROS."""
     return {"payload": serialize_message(make(find(type), value)).hex()}
 
 
 def deserialize(type: str, payload: str) -> dict[str, Any]:
-    """Return a message as ROS deserialises it."""
+    """Deserialise a message by ROS."""
     return {"value": to_json(deserialize_message(bytes.fromhex(payload), find(type)))}
 
 
 def main() -> None:
     """Run until stdin ends."""
     commands = {"hashes": hashes, "serialize": serialize, "deserialize": deserialize}
-    say("ready")
+    emit("ready")
     for line in sys.stdin:
         command = json.loads(line)
         do, number = command.pop("do"), command.pop("id")
-        say(do, id=number, **commands[do](**command))
+        emit(do, id=number, **commands[do](**command))
 
 
 if __name__ == "__main__":

@@ -1,8 +1,8 @@
-"""Common parts of the rclpy programs: commands in on stdin, events out on stdout, as JSON.
+"""Common parts of the rclpy programs: read commands on stdin, print events on stdout, as JSON.
 
 A command is a line `{"do": name, "id": number, ...}`; the answer is an event with the same name and
 id. A program ends when its stdin ends, or with the exception of a command that fails.
-Times are of the monotonic clock, which all processes of a machine share.
+Times are from the monotonic clock, which all processes of a machine share.
 """
 
 import json
@@ -18,20 +18,20 @@ from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
-from tests.ros2.programs.say import say
+from tests.ros2.programs.events import emit
 
 Command = Callable[..., Mapping[str, Any] | None]
 
 
 class Console:
-    """One node, its commands, and the executor that runs both in one thread."""
+    """A node and its commands, which run in one thread of an executor."""
 
     def __init__(self, settings: Mapping[str, Any]) -> None:
         rclpy.init()
         self.node = Node(settings["node"], namespace=settings.get("namespace", "/"))
         self.commands: dict[str, Command] = {}
         self._lines: queue.SimpleQueue[str] = queue.SimpleQueue()
-        self._came = self.node.create_guard_condition(self._obey)
+        self._line_arrived = self.node.create_guard_condition(self._obey)
         self._ended = False
 
     def run(self) -> None:
@@ -39,7 +39,7 @@ class Console:
         executor = SingleThreadedExecutor()
         executor.add_node(self.node)
         threading.Thread(target=self._read, daemon=True).start()
-        say("ready", pid=os.getpid())
+        emit("ready", pid=os.getpid())
         try:
             while not self._ended:
                 executor.spin_once()
@@ -52,16 +52,16 @@ class Console:
     def _read(self) -> None:
         for line in sys.stdin:
             self._lines.put(line)
-            self._came.trigger()
+            self._line_arrived.trigger()
         self._ended = True
-        self._came.trigger()
+        self._line_arrived.trigger()
 
     def _obey(self) -> None:
         while not self._lines.empty():
             command = json.loads(self._lines.get())
             do, number = command.pop("do"), command.pop("id")
             answer = self.commands[do](**command) or {}
-            say(do, id=number, **answer)
+            emit(do, id=number, **answer)
 
 
 def start() -> Console:
@@ -77,9 +77,9 @@ def profile(reliable: bool = True, transient_local: bool = False, depth: int = 1
 
 
 def endpoints(node: Node, topic: str) -> dict[str, list[dict[str, Any]]]:
-    """Return what ROS knows of the publishers and subscribers of a topic."""
+    """Return the publishers and subscribers of a topic that ROS knows."""
 
-    def one(info: Any) -> dict[str, Any]:
+    def described(info: Any) -> dict[str, Any]:
         return {
             "node": info.node_name,
             "namespace": info.node_namespace,
@@ -92,6 +92,6 @@ def endpoints(node: Node, topic: str) -> dict[str, list[dict[str, Any]]]:
         }
 
     return {
-        "publishers": [one(info) for info in node.get_publishers_info_by_topic(topic)],
-        "subscribers": [one(info) for info in node.get_subscriptions_info_by_topic(topic)],
+        "publishers": [described(info) for info in node.get_publishers_info_by_topic(topic)],
+        "subscribers": [described(info) for info in node.get_subscriptions_info_by_topic(topic)],
     }

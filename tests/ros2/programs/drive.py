@@ -1,7 +1,7 @@
 """Publishes commands at a rate, and single messages of any type.
 
-Commands: `drive` and `rest` (Twist or TwistStamped), `publish`, `endpoints`. Each command that is
-sent at a rate is an event `sent`, so that its last one is known where the program was killed.
+Commands: `drive`, `rest` (Twist or TwistStamped), `advertise`, `publish`, `readers`, `endpoints`.
+Each message of `drive` is also an event `sent`, so that the last one is known after a kill.
 """
 
 from typing import Any
@@ -9,8 +9,8 @@ from typing import Any
 from rclpy.publisher import Publisher
 
 from tests.ros2.programs.console import endpoints, profile, start
+from tests.ros2.programs.events import emit
 from tests.ros2.programs.messages import find, make
-from tests.ros2.programs.say import say
 
 TWIST = "geometry_msgs/msg/Twist"
 
@@ -52,7 +52,7 @@ def main() -> None:
         def send() -> None:
             if stamped:
                 stamp(message, node.get_clock().now().nanoseconds - int(late_s * 1e9), frame)
-            say("sent", topic=topic)
+            emit("sent", topic=topic)
             to.publish(message)
 
         rest(topic)

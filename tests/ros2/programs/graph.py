@@ -1,4 +1,4 @@
-"""Lists the nodes, topics and services that ROS finds. Commands: `graph`, `endpoints`."""
+"""Lists the nodes, topics and services that ROS discovers. Commands: `graph`, `endpoints`."""
 
 from typing import Any
 

@@ -1,6 +1,6 @@
-"""Subscribes to topics and reports what came, when, and what ROS knows of the endpoints.
+"""Subscribes to topics, and reports messages, times and endpoints.
 
-Commands: `subscribe`, `unsubscribe`, `report` (count, rate, times, the last values), `endpoints`.
+Commands: `subscribe`, `unsubscribe`, `report` (count, rate, times, newest values), `endpoints`.
 """
 
 import time
@@ -10,24 +10,24 @@ from typing import Any
 from rclpy.clock import Clock
 
 from tests.ros2.programs.console import endpoints, profile, start
+from tests.ros2.programs.events import emit
 from tests.ros2.programs.messages import find, to_json
-from tests.ros2.programs.say import say
 
-KEPT = 1000  # times of arrival that are kept for each topic
+MAX_TIMES = 1000  # arrival times that are kept for each topic
 
 
 class Topic:
-    """Keeps what came on one topic."""
+    """Keeps the newest messages of one topic, and their times."""
 
     def __init__(self, name: str, stream: bool, keep: int) -> None:
         self.count = 0
         self._name, self._stream = name, stream
-        self._times_ns: deque[int] = deque(maxlen=KEPT)
-        self._sent_ns: deque[int] = deque(maxlen=KEPT)
+        self._times_ns: deque[int] = deque(maxlen=MAX_TIMES)
+        self._sent_ns: deque[int] = deque(maxlen=MAX_TIMES)
         self._last: deque[Any] = deque(maxlen=keep)
 
     def take(self, message: Any, info: dict[str, int]) -> None:
-        """Take a message, with the clock times at which it was sent and received."""
+        """Add a message; `info` has the Unix time at which it was sent."""
         now_ns = time.monotonic_ns()
         self.count += 1
         self._times_ns.append(now_ns)
@@ -35,10 +35,10 @@ class Topic:
         self._last.append(message)
         if self._stream:
             value = to_json(message)
-            say("message", topic=self._name, at_ns=now_ns, value=value)
+            emit("message", topic=self._name, at_ns=now_ns, value=value)
 
     def report(self) -> dict[str, Any]:
-        """Return what came; `hz` is the mean rate between the first and the last time."""
+        """Return the statistics; `hz` is the mean rate between the first and the last kept time."""
         times = list(self._times_ns)
         span_ns = times[-1] - times[0] if len(times) > 1 else 0
         return {
@@ -59,9 +59,9 @@ def main() -> None:
     def subscribe(
         topic: str, type: str, qos: dict[str, Any], stream: bool = False, keep: int = 1
     ) -> None:
-        kept = topics[topic] = Topic(topic, stream, keep)
+        statistics = topics[topic] = Topic(topic, stream, keep)
         subscriptions[topic] = console.node.create_subscription(
-            find(type), topic, kept.take, profile(**qos)
+            find(type), topic, statistics.take, profile(**qos)
         )
 
     def unsubscribe(topic: str) -> None:

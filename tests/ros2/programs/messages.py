@@ -1,4 +1,4 @@
-"""Turns messages of any installed type into JSON and back, by their fields."""
+"""Converts messages of any installed type to JSON and back, by their fields."""
 
 import importlib
 from array import array
@@ -38,7 +38,7 @@ def to_json(value: Any) -> Any:
 
 
 def make(message_type: Any, values: Mapping[str, Any]) -> Any:
-    """Return a message with these values; what is left out has its default."""
+    """Return a message with these values; omitted fields have their defaults."""
     message = message_type()
     types = message.get_fields_and_field_types()
     for name, value in values.items():
@@ -47,7 +47,7 @@ def make(message_type: Any, values: Mapping[str, Any]) -> Any:
 
 
 def _field(type_name: str, default: Any, value: Any) -> Any:
-    """Return one field's value: nested, a sequence of those, bytes, or plain."""
+    """Return a field's value: a message, a sequence of messages, bytes, an array, or plain."""
     if hasattr(default, "get_fields_and_field_types"):
         return make(type(default), value)
     inner = type_name.removeprefix("sequence<").partition(">")[0].partition("[")[0]
@@ -55,9 +55,9 @@ def _field(type_name: str, default: Any, value: Any) -> Any:
     if isinstance(value, list) and "/" in inner:
         package, short = inner.split("/")
         item = find(f"{package}/msg/{short}")
-        return [make(item, one) for one in value]
+        return [make(item, each) for each in value]
     if "octet" in type_name:
-        return [bytes([one]) for one in value] if isinstance(value, list) else bytes([value])
+        return [bytes([each]) for each in value] if isinstance(value, list) else bytes([value])
     if isinstance(default, np.ndarray):
         return np.array(value, default.dtype)
     return value

@@ -1,7 +1,7 @@
 """Sends goals to action servers of any type.
 
-Commands: `available`, `send` (a goal, by a name), `cancel`. Events by that name: `accepted` or
-`rejected`, `feedback`, `cancelled` (the answer to the request), `result` with its status.
+Commands: `available`, `send` (a goal with a name), `cancel`. Events with that name: `accepted` or
+`rejected`, `feedback`, `cancelled` (the response to the request), `result` with its status.
 """
 
 import time
@@ -10,8 +10,8 @@ from typing import Any
 from rclpy.action import ActionClient
 
 from tests.ros2.programs.console import start
+from tests.ros2.programs.events import emit
 from tests.ros2.programs.messages import find, make, to_json
-from tests.ros2.programs.say import say
 
 STATUS = ("unknown", "accepted", "executing", "canceling", "succeeded", "canceled", "aborted")
 
@@ -34,20 +34,20 @@ def main() -> None:
         sent_ns = time.monotonic_ns()
 
         def feedback(message: Any) -> None:
-            say("feedback", name=name, value=to_json(message.feedback))
+            emit("feedback", name=name, value=to_json(message.feedback))
 
         def result(done: Any) -> None:
             answer = done.result()
             value = to_json(answer.result)
-            say("result", name=name, status=STATUS[answer.status], value=value)
+            emit("result", name=name, status=STATUS[answer.status], value=value)
 
         def decided(done: Any) -> None:
             handle = goals[name] = done.result()
             took_s = (time.monotonic_ns() - sent_ns) / 1e9
             if not handle.accepted:
-                say("rejected", name=name, took_s=took_s)
+                emit("rejected", name=name, took_s=took_s)
                 return
-            say("accepted", name=name, took_s=took_s)
+            emit("accepted", name=name, took_s=took_s)
             handle.get_result_async().add_done_callback(result)
 
         message = make(find(type).Goal, goal)
@@ -57,7 +57,7 @@ def main() -> None:
     def cancel(name: str) -> None:
         def show(done: Any) -> None:
             answer = done.result()
-            say("cancelled", name=name, code=answer.return_code, goals=len(answer.goals_canceling))
+            emit("cancelled", name=name, code=answer.return_code, goals=len(answer.goals_canceling))
 
         goals[name].cancel_goal_async().add_done_callback(show)
 

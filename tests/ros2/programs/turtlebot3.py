@@ -1,10 +1,10 @@
-"""Plays a TurtleBot3 Burger: its controller board and lidar in a world of walls, and its ROS node.
+"""Simulates a TurtleBot3 Burger: its controller board and lidar among walls, and its ROS node.
 
-The node (`turtlebot3_node`) is a process of its own, as it is on the robot's computer. This one
-goes on while the node is killed or frozen: the board keeps the last command, as its firmware does,
-until the node's heartbeat has been missing for 500 ms, and `truth` tells where that has led.
+The node (`turtlebot3_node`) is a separate process, as on the robot's computer. The simulation
+continues while the node is killed or frozen. As in the firmware, the board keeps the last command
+until the heartbeat of the node is missing for 500 ms. `truth` returns the resulting pose.
 
-Commands: `truth`, `place` (elsewhere), `start_node`. Events: `node` with its pid, `node_ended`.
+Commands: `truth`, `place` (set the pose), `start_node`. Events: `node` with its pid, `node_ended`.
 Settings: `walls` (segments [x1, y1, x2, y2] in metres), `start` [x, y, angle], `lidar` (`lds01` or
 `lds02`), `stamped` (obeys TwistStamped), `hz` of the lidar, `noise_m` of its ranges, `seed`.
 """
@@ -23,11 +23,11 @@ from typing import Any
 
 import numpy as np
 
-from tests.ros2.programs.say import say
+from tests.ros2.programs.events import emit
 
 TICK_S = 0.01
 WHEEL_RADIUS_M, WHEEL_SEPARATION_M = 0.033, 0.160
-BODY_RADIUS_M, PARTED_M = 0.105, 0.005
+BODY_RADIUS_M, RELEASE_M = 0.105, 0.005
 MAX_SPEED_MPS, MAX_TURN_RADPS = 0.22, 2.84
 ACCELERATION_MPS2, TURN_ACCELERATION_RADPS2 = 2.0, 15.0
 HEARTBEAT_TIMEOUT_S = 0.5  # of the firmware
@@ -44,8 +44,8 @@ class Lidar:
     samples_per_s: float
     range_min_m: float
     range_max_m: float  # as published
-    reach_m: float
-    nothing: float  # the range where it sees nothing
+    reach_m: float  # the real maximum range
+    no_return: float  # the published range without a return
 
 
 LIDARS = {
@@ -57,7 +57,7 @@ LIDARS = {
 def cast(
     walls: np.ndarray, x_m: float, y_m: float, angles_rad: np.ndarray, reach_m: float
 ) -> np.ndarray:
-    """Return the distance [m] to the first wall (n, 4) along each angle (m,), or inf."""
+    """Return the distances [m] (m,) to the first of the walls (n, 4) along angles (m,), or inf."""
     origins, spans = walls[:, :2] - (x_m, y_m), walls[:, 2:] - walls[:, :2]
     c, s = np.cos(angles_rad)[:, None], np.sin(angles_rad)[:, None]
     across = c * spans[:, 1] - s * spans[:, 0]
@@ -69,7 +69,7 @@ def cast(
 
 
 def clearance(walls: np.ndarray, x_m: float, y_m: float) -> float:
-    """Return the distance [m] of a point to the nearest wall."""
+    """Return the distance [m] from a point to the nearest wall."""
     spans = walls[:, 2:] - walls[:, :2]
     offsets = np.array((x_m, y_m)) - walls[:, :2]
     lengths = np.maximum((spans**2).sum(axis=1), 1e-12)
@@ -86,18 +86,18 @@ class Board:
         self.speed_mps = self.turn_radps = 0.0
         self.wheels_rad = [0.0, 0.0]
         self.contacts = 0
-        self.nearest_m = math.inf  # to the body's centre, so far
+        self.nearest_m = math.inf  # minimum distance of a wall to the body's centre, so far
         self.travelled_m = 0.0
         self._command = (0.0, 0.0)
         self._heartbeat_s = -math.inf
         self._touches = False
 
     def beat(self, now_s: float) -> None:
-        """Take a heartbeat of the node."""
+        """Receive a heartbeat of the node."""
         self._heartbeat_s = now_s
 
     def command(self, hundredths: tuple[int, int]) -> None:
-        """Take a command: speeds [0.01 m/s, 0.01 rad/s]."""
+        """Receive a command: speeds [0.01 m/s, 0.01 rad/s]."""
         speed, turn = (value / 100 for value in hundredths)
         self._command = (
             min(max(speed, -MAX_SPEED_MPS), MAX_SPEED_MPS),
@@ -105,7 +105,7 @@ class Board:
         )
 
     def step(self, now_s: float, dt_s: float) -> None:
-        """Let time pass."""
+        """Advance the simulation by `dt_s`."""
         if now_s - self._heartbeat_s > HEARTBEAT_TIMEOUT_S:
             self._command = (0.0, 0.0)
         self.speed_mps = _toward(self.speed_mps, self._command[0], ACCELERATION_MPS2 * dt_s)
@@ -119,32 +119,32 @@ class Board:
         self._move(dt_s)
 
     def _move(self, dt_s: float) -> None:
-        """Move unless a wall is in the way; the wheels slip then."""
+        """Move the body, unless a wall blocks it; the wheels slip then."""
         middle_rad = self.angle_rad + self.turn_radps * dt_s / 2
         self.angle_rad = math.remainder(self.angle_rad + self.turn_radps * dt_s, math.tau)
         x_m = self.x_m + self.speed_mps * dt_s * math.cos(middle_rad)
         y_m = self.y_m + self.speed_mps * dt_s * math.sin(middle_rad)
-        before_m, room_m = (
+        before_m, clearance_m = (
             clearance(self.walls, self.x_m, self.y_m),
             clearance(self.walls, x_m, y_m),
         )
-        touches = room_m < BODY_RADIUS_M and room_m < before_m
+        touches = clearance_m < BODY_RADIUS_M and clearance_m < before_m
         self.contacts += touches and not self._touches
-        # one contact lasts until it has clearly gone away
-        self._touches = touches or (self._touches and room_m < BODY_RADIUS_M + PARTED_M)
+        # a contact ends once the body has moved RELEASE_M away
+        self._touches = touches or (self._touches and clearance_m < BODY_RADIUS_M + RELEASE_M)
         if not touches:
             self.travelled_m += abs(self.speed_mps) * dt_s
             self.x_m, self.y_m = x_m, y_m
-        self.nearest_m = min(self.nearest_m, room_m)
+        self.nearest_m = min(self.nearest_m, clearance_m)
 
 
-def _toward(value: float, wanted: float, most: float) -> float:
-    """Return `value` moved to `wanted` by at most `most`."""
-    return value + min(max(wanted - value, -most), most)
+def _toward(value: float, target: float, max_change: float) -> float:
+    """Return `value` changed towards `target` by at most `max_change`."""
+    return value + min(max(target - value, -max_change), max_change)
 
 
 class Robot:
-    """Board, lidar and the process of the node, and the line between them."""
+    """The board, the lidar and the process of the node, which a socket connects."""
 
     def __init__(self, settings: Mapping[str, Any]) -> None:
         walls = np.array(settings.get("walls", ()), dtype=float).reshape(-1, 4)
@@ -169,10 +169,10 @@ class Robot:
             self._node = subprocess.Popen(
                 command, stdin=subprocess.DEVNULL, stdout=sys.stderr, pass_fds=(far.fileno(),)
             )
-        say("node", pid=self._node.pid)
+        emit("node", pid=self._node.pid)
 
     def end_node(self) -> None:
-        """End the process of the node, as a broken computer would."""
+        """Kill the process of the node."""
         if self._node:
             self._node.kill()
             self._node.wait()
@@ -182,16 +182,16 @@ class Robot:
             self._line = None
 
     def step(self, now_s: float, dt_s: float) -> None:
-        """Let time pass: take what the node has sent, move, and send a scan when it is due."""
-        self._take(now_s)
-        steps = max(1, round(dt_s / TICK_S))  # more than one where the machine was busy
+        """Process messages of the node, advance the simulation, and send a scan when it is due."""
+        self._process_messages(now_s)
+        steps = max(1, round(dt_s / TICK_S))  # several after a delay of a busy machine
         for _ in range(steps):
             self.board.step(now_s, dt_s / steps)
         if now_s >= self._next_turn_s:
             self._next_turn_s = max(self._next_turn_s + 1 / self._lidar_hz, now_s)
             self._send({"scan": self._scan(), "taken_ns": time.time_ns()})
 
-    def _take(self, now_s: float) -> None:
+    def _process_messages(self, now_s: float) -> None:
         while self._line:
             try:
                 packet = self._line.recv(PACKET_BYTES)
@@ -200,24 +200,24 @@ class Robot:
             except ConnectionResetError:
                 packet = b""
             if not packet:
-                say("node_ended", code=self._node.wait() if self._node else None)
+                emit("node_ended", code=self._node.wait() if self._node else None)
                 self._node = None
                 self._line.close()
                 self._line = None
                 return
-            said = json.loads(packet)
-            if "command" in said:
-                self.board.command(said["command"])
-            elif "heartbeat" in said:
+            message = json.loads(packet)
+            if "command" in message:
+                self.board.command(message["command"])
+            elif "heartbeat" in message:
                 self.board.beat(now_s)
             else:
                 self._send({"registers": self._registers()})
 
-    def _send(self, what: Mapping[str, Any]) -> None:
-        """Send to the node; what a frozen one does not take is lost."""
+    def _send(self, message: Mapping[str, Any]) -> None:
+        """Send to the node; a message to a frozen node is lost."""
         if self._line:
             try:
-                self._line.send(json.dumps(what).encode())
+                self._line.send(json.dumps(message).encode())
             except (BlockingIOError, BrokenPipeError):
                 return
 
@@ -233,7 +233,7 @@ class Robot:
         }
 
     def _scan(self) -> dict[str, Any]:
-        """Take a turn of the lidar, counter-clockwise from straight ahead."""
+        """Return a scan of the lidar, counter-clockwise from straight ahead."""
         board, lidar = self.board, self._lidar
         count = round(lidar.samples_per_s / self._lidar_hz)
         angles_rad = np.arange(count) * (math.tau / count)
@@ -241,7 +241,7 @@ class Robot:
         y_m = board.y_m + LIDAR_X_M * math.sin(board.angle_rad)
         ranges_m = cast(board.walls, x_m, y_m, angles_rad + board.angle_rad, lidar.reach_m)
         ranges_m += self._random.normal(0.0, self._noise_m, count) if self._noise_m else 0.0
-        ranges_m[~np.isfinite(ranges_m)] = lidar.nothing
+        ranges_m[~np.isfinite(ranges_m)] = lidar.no_return
         return {
             "ranges": np.round(ranges_m, 3).tolist(),
             "angle_increment": math.tau / count,
@@ -268,7 +268,7 @@ def main() -> None:
         elif do == "start_node":
             robot.start_node()
         pose = [board.x_m, board.y_m, board.angle_rad]
-        say(
+        emit(
             do,
             id=id,
             pose=pose,
@@ -281,7 +281,7 @@ def main() -> None:
 
     threading.Thread(target=read, daemon=True).start()
     robot.start_node()
-    say("ready")
+    emit("ready")
     before_s = time.monotonic()
     try:
         while True:

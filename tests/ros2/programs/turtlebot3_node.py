@@ -1,9 +1,9 @@
-"""The node of a TurtleBot3, as `turtlebot3_node` and the lidar's driver of ROS Jazzy behave.
+"""The node of a TurtleBot3, which behaves as `turtlebot3_node` and the lidar driver of ROS Jazzy.
 
-Started by `turtlebot3`, with which it talks over a line. Names, frames, rates, QoS and units are
-those of the originals, with what is odd in them: speeds are cut to hundredths, a command is kept
-for ever, battery percentages go to 100, joint velocities are those of the rims [m/s], the last step
-of odometry before the heading passes half a turn goes backwards, and nothing has a covariance.
+`turtlebot3` starts it, and communicates with it over a socket. Names, frames, rates, QoS and units
+are those of the originals, including their oddities. Speeds are truncated to hundredths. A command
+is kept for ever. Battery percentages go up to 100. Joint velocities are those of the rims [m/s].
+The odometry step in which the heading passes half a turn goes backwards. Nothing has a covariance.
 """
 
 import json
@@ -31,7 +31,7 @@ from tests.ros2.programs.console import profile
 SENSORS_S, HEARTBEAT_S, POLL_S = 0.05, 0.1, 0.005
 WHEEL_RADIUS_M = 0.033
 EMPTY_V, FULL_V = 10.5, 12.3
-FIXED = {  # from `base_link` or, for that itself, from `base_footprint` [m]
+STATIC_FRAMES = {  # (parent, translation [m])
     "base_link": ("base_footprint", (0.0, 0.0, 0.010)),
     "imu_link": ("base_link", (-0.032, 0.0, 0.068)),
     "base_scan": ("base_link", (-0.032, 0.0, 0.172)),
@@ -39,12 +39,12 @@ FIXED = {  # from `base_link` or, for that itself, from `base_footprint` [m]
 
 
 def stamp(ns: int) -> Any:
-    """Return a time of ROS."""
+    """Return a ROS time."""
     return rclpy.time.Time(nanoseconds=ns).to_msg()
 
 
 def heading(angle_rad: float) -> Quaternion:
-    """Return a turn round the vertical."""
+    """Return the quaternion of a yaw angle."""
     return Quaternion(z=math.sin(angle_rad / 2), w=math.cos(angle_rad / 2))
 
 
@@ -58,55 +58,55 @@ class TurtleBot3(Node):
         self._prefix = f"{space}/" if space else ""
         self._pose = [0.0, 0.0, 0.0]
         self._before: tuple[int, list[float], float] | None = None
-        often = QoSProfile(depth=10)
+        default = QoSProfile(depth=10)
         self._scans = self.create_publisher(LaserScan, "scan", qos_profile_sensor_data)
-        self._odometry = self.create_publisher(Odometry, "odom", often)
-        self._imu = self.create_publisher(Imu, "imu", often)
-        self._battery = self.create_publisher(BatteryState, "battery_state", often)
-        self._joints = self.create_publisher(JointState, "joint_states", often)
+        self._odometry = self.create_publisher(Odometry, "odom", default)
+        self._imu = self.create_publisher(Imu, "imu", default)
+        self._battery = self.create_publisher(BatteryState, "battery_state", default)
+        self._joints = self.create_publisher(JointState, "joint_states", default)
         self._tf = self.create_publisher(TFMessage, "/tf", QoSProfile(depth=100))
         fixed = profile(transient_local=True, depth=1)
         self._static = self.create_publisher(TFMessage, "/tf_static", fixed)
-        self._static.publish(self._fixed())
+        self._static.publish(self._static_frames())
         if settings.get("stamped", False):
             self.create_subscription(
-                TwistStamped, "cmd_vel", lambda message: self._obey(message.twist), often
+                TwistStamped, "cmd_vel", lambda message: self._obey(message.twist), default
             )
         else:
-            self.create_subscription(Twist, "cmd_vel", self._obey, often)
+            self.create_subscription(Twist, "cmd_vel", self._obey, default)
         self.create_service(Trigger, "reset_odometry", self._reset)
-        self.create_timer(SENSORS_S, lambda: self._tell({"read": True}))
-        self.create_timer(HEARTBEAT_S, lambda: self._tell({"heartbeat": True}))
-        self.create_timer(POLL_S, self._take)
+        self.create_timer(SENSORS_S, lambda: self._send({"read": True}))
+        self.create_timer(HEARTBEAT_S, lambda: self._send({"heartbeat": True}))
+        self.create_timer(POLL_S, self._process_messages)
 
-    def _fixed(self) -> TFMessage:
+    def _static_frames(self) -> TFMessage:
         message = TFMessage()
-        for child, (parent, place) in FIXED.items():
-            one = TransformStamped(child_frame_id=self._prefix + child)
-            one.header.frame_id = self._prefix + parent
-            one.header.stamp = self.get_clock().now().to_msg()
-            moved = one.transform.translation
+        for child, (parent, place) in STATIC_FRAMES.items():
+            stamped = TransformStamped(child_frame_id=self._prefix + child)
+            stamped.header.frame_id = self._prefix + parent
+            stamped.header.stamp = self.get_clock().now().to_msg()
+            moved = stamped.transform.translation
             moved.x, moved.y, moved.z = place
-            message.transforms.append(one)
+            message.transforms.append(stamped)
         return message
 
-    def _tell(self, what: Mapping[str, Any]) -> None:
+    def _send(self, message: Mapping[str, Any]) -> None:
         try:
-            self._line.send(json.dumps(what).encode())
+            self._line.send(json.dumps(message).encode())
         except BlockingIOError:
             return
 
     def _obey(self, twist: Twist) -> None:
         hundredths = [int(twist.linear.x * 100), int(twist.angular.z * 100)]
-        self._tell({"command": hundredths})
+        self._send({"command": hundredths})
 
     def _reset(self, _: Any, response: Any) -> Any:
         self._pose = [0.0, 0.0, 0.0]
         response.success, response.message = True, "Odometry reset"
         return response
 
-    def _take(self) -> None:
-        """Publish the newest registers and the newest scan that the robot has sent."""
+    def _process_messages(self) -> None:
+        """Publish the newest registers and the newest scan from the robot."""
         newest: dict[str, Any] = {}
         while True:
             try:
@@ -115,7 +115,7 @@ class TurtleBot3(Node):
                 break
             except ConnectionResetError:
                 packet = b""
-            if not packet:  # the robot is gone
+            if not packet:  # the robot has ended
                 raise ExternalShutdownException
             newest |= json.loads(packet)
         if "registers" in newest:
@@ -154,10 +154,10 @@ class TurtleBot3(Node):
         battery.percentage = 100 * (volts - EMPTY_V) / (FULL_V - EMPTY_V)
         battery.header.stamp = now
         self._battery.publish(battery)
-        self._count(now_ns, registers)
+        self._update_odometry(now_ns, registers)
 
-    def _count(self, now_ns: int, registers: Mapping[str, Any]) -> None:
-        """Count odometry from wheels and gyroscope, and publish it with its transform."""
+    def _update_odometry(self, now_ns: int, registers: Mapping[str, Any]) -> None:
+        """Update odometry from wheels and gyroscope, and publish it with its transform."""
         wheels_rad, angle_rad = registers["wheels_rad"], registers["angle_rad"]
         before_ns, before_wheels, before_angle = self._before or (now_ns, wheels_rad, angle_rad)
         self._before = now_ns, wheels_rad, angle_rad
@@ -165,7 +165,7 @@ class TurtleBot3(Node):
             return
         turns = [now - then for now, then in zip(wheels_rad, before_wheels, strict=True)]
         step_m = WHEEL_RADIUS_M * sum(turns) / 2
-        turned_rad = angle_rad - before_angle  # not brought into half a turn, as in the original
+        turned_rad = angle_rad - before_angle  # not wrapped to half a turn, as in the original
         self._pose[0] += step_m * math.cos(self._pose[2] + turned_rad / 2)
         self._pose[1] += step_m * math.sin(self._pose[2] + turned_rad / 2)
         self._pose[2] += turned_rad
@@ -188,7 +188,7 @@ class TurtleBot3(Node):
 
 
 def main() -> None:
-    """Run until the robot is gone."""
+    """Run until the robot ends."""
     settings = json.loads(sys.argv[1])
     line = socket.socket(fileno=settings["line"])
     line.setblocking(False)

@@ -1,4 +1,4 @@
-"""Serves SetBool in a process of its own: `rtps_server.py DOMAIN SERVICE NAME`, until it is ended.
+"""Serves SetBool until it is killed: `rtps_server.py DOMAIN SERVICE NAME`.
 
 Its replies hold NAME, so that a test knows which of several servers answered.
 """

@@ -1,4 +1,4 @@
-"""A simulated SO-101, moved by real ROS 2 as a MoveIt or ros2_control user would."""
+"""A simulated SO-101, moved by real ROS 2 as by MoveIt or a user of ros2_control."""
 
 import asyncio
 import contextlib
@@ -25,13 +25,13 @@ HOME = (0.0, -1.7, 1.4, 0.6, 0.0, 0.0)
 ACTION, FOLLOW = "/follow_joint_trajectory", "control_msgs/action/FollowJointTrajectory"
 TRAJECTORY = "trajectory_msgs/msg/JointTrajectory"
 STATES = "sensor_msgs/msg/JointState"
-NEAR = 0.06  # [rad]: the goal tolerance, and an encoder's step
+TOLERANCE_RAD = 0.06  # the goal tolerance, and a step of the encoder
 SAG = 0.03  # [rad]
 
 
 @pytest_asyncio.fixture(loop_scope="module", scope="module")
 async def robot(shared_home: Home, shared_judge: Judge) -> AsyncIterator[Robot]:
-    """An arm that the tests share; its brain does not ask for it."""
+    """An arm that the tests share; its brain does not command it."""
     parts = {"body": "so101", "resume": "manual"}
     async with running(shared_home, shared_judge, **parts) as made:
         await made.becomes("latched")
@@ -53,7 +53,7 @@ def trajectory(*points: dict[str, Any], names: tuple[str, ...] = ("shoulder_pan"
 
 
 class Client:
-    """A client of the action in a process of ROS."""
+    """A client of the action in a ROS program."""
 
     def __init__(self, program: Program, robot: Robot) -> None:
         self.program, self._robot = program, robot
@@ -62,14 +62,14 @@ class Client:
         await self.program.query(
             "send", action=ACTION, type=FOLLOW, name=name, goal={"trajectory": sent} | goal
         )
-        await self.program.hear("accepted", name=name)
+        await self.program.wait_async("accepted", name=name)
 
     async def result(self, name: str) -> tuple[str, int]:
-        found = await self.program.hear("result", name=name)
+        found = await self.program.wait_async("result", name=name)
         return found["status"], found["value"]["error_code"]
 
     async def done(self, sent: Callable[[], Any], **goal: Any) -> tuple[str, str, int]:
-        """Send a goal, again where a busy machine let the gate stop it; return name and result."""
+        """Send a goal, again if the gate of a busy machine stopped it; return name and result."""
         while True:
             name = f"goal-{len(self.program.seen('accepted'))}"
             await self.send(name, sent(), **goal)
@@ -93,7 +93,7 @@ class Client:
             await self._robot.becomes("idle")
 
     def _stopped(self, name: str) -> bool:
-        """Return whether the gate has stopped a goal, as it does where commands come late."""
+        """Return whether the gate has stopped a goal, because commands were late."""
         found = self.program.seen("result", name=name)
         return bool(found) and "no valid command for" in found[0]["value"]["error_string"]
 
@@ -108,25 +108,27 @@ async def following(judge: Judge, robot: Robot) -> Client:
 async def test_joint_states_have_all_joints_of_the_arm(robot: Robot, judge: Judge) -> None:
     listener = judge.start("listen")
     await listener.query("subscribe", topic="/joint_states", type=STATES, qos={}, stream=True)
-    message = (await listener.hear("message", nth=10))["value"]
+    message = (await listener.wait_async("message", nth=10))["value"]
     assert message["name"] == NAMES
     assert message["position"] == pytest.approx(HOME, abs=SAG)
     assert [len(message[field]) for field in ("velocity", "effort")] == [6, 6]
     assert robot.now.gate.mode == "idle"
 
 
-async def test_the_urdf_and_the_frames_of_all_links_reach_ros(robot: Robot, judge: Judge) -> None:
+async def test_ros_receives_the_urdf_and_the_frames_of_all_links(
+    robot: Robot, judge: Judge
+) -> None:
     listener, values = judge.start("listen"), {}
     for topic in ("/robot_description", "/tf_static", "/tf"):
         kind, qos = READ[topic]
         await listener.query("subscribe", topic=topic, type=kind, qos=qos)
         report = await asyncio.to_thread(
-            listener.poll, "report", lambda one: one["count"] > 0, topic=topic
+            listener.poll, "report", lambda each: each["count"] > 0, topic=topic
         )
         values[topic] = report["values"][-1]
     joints = xml.fromstring(values["/robot_description"]["data"]).findall("joint")
     transforms = [*values["/tf"]["transforms"], *values["/tf_static"]["transforms"]]
-    frames = {one["child_frame_id"] for one in transforms}
+    frames = {each["child_frame_id"] for each in transforms}
     assert {"shoulder", "jaw", "tool"} < frames
     assert {joint.find("child").get("link") for joint in joints} == frames - {"base_footprint"}
 
@@ -144,13 +146,13 @@ async def test_a_goal_moves_the_arm_with_feedback_and_frees_it(robot: Robot, jud
 
     name, *result = await client.done(there)
     assert result == ["succeeded", 0]
-    assert pan(robot) == pytest.approx(0.6, abs=NEAR)
-    assert robot.now.joints[2].position == pytest.approx(1.0, abs=NEAR)
+    assert pan(robot) == pytest.approx(0.6, abs=TOLERANCE_RAD)
+    assert robot.now.joints[2].position == pytest.approx(1.0, abs=TOLERANCE_RAD)
     assert robot.now.gate.commander == "ros2"
-    told = [one["value"] for one in client.program.seen("feedback", name=name)]
+    told = [each["value"] for each in client.program.seen("feedback", name=name)]
     assert len(told) > 10
-    assert {tuple(one["joint_names"]) for one in told} == {tuple(NAMES)}
-    half = min(told, key=lambda one: abs(one["desired"]["positions"][0] - 0.3))
+    assert {tuple(each["joint_names"]) for each in told} == {tuple(NAMES)}
+    half = min(told, key=lambda each: abs(each["desired"]["positions"][0] - 0.3))
     actual, desired = (half[part]["positions"][0] for part in ("actual", "desired"))
     assert actual == pytest.approx(desired, abs=0.15)
     assert half["error"]["positions"][0] == pytest.approx(desired - actual)
@@ -158,9 +160,7 @@ async def test_a_goal_moves_the_arm_with_feedback_and_frees_it(robot: Robot, jud
     assert robot.now.gate.commander == ""
 
 
-async def test_goals_that_cannot_be_followed_have_codes_and_move_nothing(
-    robot: Robot, judge: Judge
-) -> None:
+async def test_invalid_goals_have_error_codes_and_move_nothing(robot: Robot, judge: Judge) -> None:
     client, before = await following(judge, robot), pan(robot)
     wrong = {
         "fast": (trajectory(point(0.1, -1.5)), -1),
@@ -192,7 +192,7 @@ async def test_goals_are_cancelled_and_preempted(robot: Robot, judge: Judge) -> 
 
 
 @pytest.mark.slow
-async def test_a_tolerance_that_cannot_be_kept_ends_a_goal(robot: Robot, judge: Judge) -> None:
+async def test_a_violated_tolerance_ends_a_goal(robot: Robot, judge: Judge) -> None:
     client = await following(judge, robot)
 
     def away() -> Any:
@@ -208,7 +208,7 @@ async def test_a_tolerance_that_cannot_be_kept_ends_a_goal(robot: Robot, judge: 
 
 
 @pytest.mark.slow
-async def test_the_topic_moves_the_arm_and_wild_messages_are_named(
+async def test_the_topic_moves_the_arm_and_invalid_messages_are_reported(
     robot: Robot, judge: Judge
 ) -> None:
     sender = judge.start("drive")
@@ -217,7 +217,7 @@ async def test_the_topic_moves_the_arm_and_wild_messages_are_named(
     async def publish(message: Any) -> None:
         await sender.query("publish", topic="/joint_trajectory", type=TRAJECTORY, value=message)
 
-    while not refused():  # until the subscription is found
+    while not refused():  # until the subscription is discovered
         await publish(trajectory(point(1.0, 0.1), names=("elbow",)))
         await asyncio.sleep(0.5)
     await until(lambda: "no joint 'elbow'" in refused(), "it is named")
@@ -225,8 +225,8 @@ async def test_the_topic_moves_the_arm_and_wild_messages_are_named(
         await publish(trajectory(*(point(0.001 * n, 0.1) for n in range(1, count))))
     await until(lambda: "would have to move" in refused(), "it is too fast")
     assert robot.now.gate.mode == "idle"
-    while abs(pan(robot) - 0.3) > NEAR:  # on a busy machine the gate may stop it
-        await asyncio.sleep(1.0)  # as the sender has to pause then
+    while abs(pan(robot) - 0.3) > TOLERANCE_RAD:  # the gate of a busy machine may stop it,
+        await asyncio.sleep(1.0)  # and then the sender has to pause
         await publish(trajectory(point(2.0, 0.3)))
         with contextlib.suppress(TimeoutError):
             await until(lambda: robot.now.gate.commander == "ros2", "it moves", 10.0)
@@ -250,7 +250,7 @@ async def test_the_example_moves_two_joints(robot: Robot, judge: Judge, ros2: Pa
 
 
 async def held(robot: Robot) -> tuple[float, ...]:
-    """Return where the joints are sent, once that no longer changes."""
+    """Return the commanded positions, once they no longer change."""
     sent: list[tuple[float, ...]] = []
 
     def rests() -> bool:

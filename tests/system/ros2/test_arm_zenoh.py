@@ -1,4 +1,4 @@
-"""A simulated SO-101, moved over `rmw_zenoh` by a node of ours."""
+"""A simulated SO-101, moved over `rmw_zenoh` by one of our nodes."""
 
 import uuid
 from typing import Any
@@ -45,7 +45,7 @@ async def test_a_goal_and_the_topic_move_the_arm(home: Home) -> None:
             publisher = node.publisher("/joint_trajectory", TRAJECTORY)
             await until(lambda: publisher.readers == 1, "the gateway")
             await released(robot)
-            while abs(places[0] - 0.4) > 0.06:  # on a busy machine the gate may stop it
+            while abs(places[0] - 0.4) > 0.06:  # the gate of a busy machine may stop it
                 id = {"uuid": uuid.uuid4().bytes}
                 goal = types.make(f"{FOLLOW}_Goal", trajectory=trajectory(0.4))
                 assert (await ask("SendGoal", goal_id=id, goal=goal)).accepted

@@ -1,4 +1,4 @@
-"""Tests of the DDS transport alone, with our participants in this process."""
+"""Tests of the DDS transport, with our participants in this process."""
 
 import asyncio
 import contextlib
@@ -34,7 +34,7 @@ async def test_a_reliable_reader_does_not_match_a_best_effort_publisher(nodes: N
 
 
 @pytest.mark.parametrize("taken", [118, 119])
-async def test_where_many_have_joined_it_stays_on_the_loopback_or_is_refused(taken: int) -> None:
+async def test_beside_many_participants_it_joins_on_the_loopback_or_is_refused(taken: int) -> None:
     with free_domain() as domain, contextlib.ExitStack() as others:
         for index in range(taken):
             for port in participant_ports(domain, index):
@@ -55,7 +55,7 @@ async def test_where_many_have_joined_it_stays_on_the_loopback_or_is_refused(tak
 
 
 @pytest.mark.parametrize("part", ["Bridge", "_StatusWatcher"])
-async def test_where_it_cannot_be_opened_nothing_is_left(
+async def test_a_failed_opening_leaves_nothing_open(
     monkeypatch: pytest.MonkeyPatch, part: str
 ) -> None:
     def fail(*_: object) -> None:
@@ -74,7 +74,7 @@ async def test_where_it_cannot_be_opened_nothing_is_left(
                 free.bind(("127.0.0.1", port))
 
 
-async def test_what_is_no_message_of_the_type_is_not_sent(nodes: Nodes) -> None:
+async def test_a_payload_of_another_type_is_not_sent(nodes: Nodes) -> None:
     talker, listener = await nodes.node("talker"), await nodes.node("listener")
     got: list[Received] = []
     listener.subscribe("/chatter", STRING, Qos(), got.append)
@@ -87,7 +87,7 @@ async def test_what_is_no_message_of_the_type_is_not_sent(nodes: Nodes) -> None:
     assert [nodes.text(each.payload) for each in got] == ["hi"]
 
 
-async def test_a_busy_loop_keeps_the_newest(nodes: Nodes) -> None:
+async def test_a_busy_loop_keeps_the_newest_messages(nodes: Nodes) -> None:
     talker, listener = await nodes.node("talker"), await nodes.node("listener")
     got: list[str] = []
     listener.subscribe(

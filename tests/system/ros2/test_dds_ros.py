@@ -62,7 +62,9 @@ async def test_rclpy_finds_our_node_and_its_endpoints(
         pass
 
 
-async def test_we_find_rclpys_nodes_and_endpoints(judge: Judge, node: DdsTransport) -> None:
+async def test_our_node_finds_the_nodes_and_endpoints_of_rclpy(
+    judge: Judge, node: DdsTransport
+) -> None:
     serve = judge.start("serve", node="server", namespace="/other")
     await serve.query("service", service="/release", type=TRIGGER)
     drive = judge.start("drive", node="hands")
@@ -82,7 +84,7 @@ async def test_we_find_rclpys_nodes_and_endpoints(judge: Judge, node: DdsTranspo
 
 
 @pytest.mark.slow  # Fast DDS's lease is 20 s
-async def test_a_killed_rclpy_is_forgotten_after_its_lease(
+async def test_a_killed_rclpy_node_is_forgotten_after_its_lease(
     judge: Judge, node: DdsTransport
 ) -> None:
     publisher = node.publisher("scan", SCAN, SENSOR_DATA)
@@ -94,7 +96,7 @@ async def test_a_killed_rclpy_is_forgotten_after_its_lease(
 
 
 class Walk:
-    """Walks until it is cancelled or preempted, or has sent all its feedback."""
+    """A handler whose goal runs until it is cancelled or preempted, or has sent all feedback."""
 
     def __init__(self) -> None:
         self.goals: list[Any] = []
@@ -129,18 +131,18 @@ async def test_rclpys_goals_are_followed_preempted_and_cancelled(
     pose = {"header": {"frame_id": "map"}, "pose": {"position": {"x": 1.5}}}
     for name in ("first", "second"):
         await client.query("send", **action, name=name, goal={"pose": pose})
-        await client.hear("accepted", name=name)
-        received = await client.hear("feedback", name=name)
+        await client.wait_async("accepted", name=name)
+        received = await client.wait_async("feedback", name=name)
         assert received["value"]["distance_remaining"] > 0
-    assert (await client.hear("result", name="first"))["status"] == "aborted"
+    assert (await client.wait_async("result", name="first"))["status"] == "aborted"
     await client.query("cancel", name="second")
-    assert (await client.hear("cancelled", name="second"))["goals"] == 1
-    assert (await client.hear("result", name="second"))["status"] == "canceled"
+    assert (await client.wait_async("cancelled", name="second"))["goals"] == 1
+    assert (await client.wait_async("result", name="second"))["status"] == "canceled"
     await client.query("send", **action, name="third", goal={"behavior_tree": "short"})
-    third = await client.hear("result", name="third")
+    third = await client.wait_async("result", name="third")
     assert (third["status"], third["value"]["error_msg"]) == ("succeeded", "there")
     await client.query("send", **action, name="fourth", goal={"behavior_tree": "none"})
-    await client.hear("rejected", name="fourth")
+    await client.wait_async("rejected", name="fourth")
     assert walk.goals[0].pose.pose.position.x == 1.5
     await server.close()
 
@@ -155,7 +157,7 @@ async def test_services_go_both_ways(judge: Judge, node: DdsTransport, types: Ty
     service = {"service": "/robot1/estop", "type": TRIGGER}
     await caller.available(**service)
     await caller.query("call", **service)
-    assert (await caller.hear("response"))["value"] == {"success": True, "message": "stopped"}
+    assert (await caller.wait_async("response"))["value"] == {"success": True, "message": "stopped"}
     serve = judge.start("serve", node="server")
     await serve.query("service", service="/release", type=TRIGGER, success=True, message="free")
     request = types.encode(f"{TRIGGER}_Request", types.make(f"{TRIGGER}_Request"))

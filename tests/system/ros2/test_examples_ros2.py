@@ -20,18 +20,18 @@ from tests.ros2.foreign import built, rclnodejs
 from tests.ros2.judge import Judge
 
 EXAMPLES = ROOT / "examples/ros2"
-PICO = os.environ.get("ZENOH_PICO", "")  # a folder of zenoh-pico with its build; no registry has it
-LONGEST_S = 400.0
+PICO = os.environ.get("ZENOH_PICO", "")  # folder of a built zenoh-pico, which is in no registry
+TIMEOUT_S = 400.0
 NOTHING_IS_NEAR, ALL_IS_NEAR = "0.001", "100"  # [m]
 
 
 @contextlib.asynccontextmanager
 async def driving(home: Home, router: str, **ros2: Any) -> AsyncIterator[Any]:
-    """Yield the newest state of a robot that drives, with the gateway."""
+    """Run a robot with the gateway, and let it drive; yield its newest state."""
     file = home.deployment(body="mock", resume="auto", router=router, ros2=ros2)
     home.start("up", str(file))
     session = connect(Endpoint(connect=(router,)), "test", timeout_s=None)
-    async with asyncio.timeout(LONGEST_S), session as bus:
+    async with asyncio.timeout(TIMEOUT_S), session as bus:
         latest = bus.latest(STATE)
         await until(lambda: latest.newest and latest.newest.gate.mode == "enabled", "it drives")
         yield latest
@@ -41,7 +41,7 @@ async def driving(home: Home, router: str, **ros2: Any) -> AsyncIterator[Any]:
 async def started(
     command: tuple[str, ...], environment: Mapping[str, str]
 ) -> AsyncIterator[asyncio.subprocess.Process]:
-    """Run a program, and end it with the context."""
+    """Run a program until the end of the context."""
     process = await asyncio.create_subprocess_exec(
         *command, env=environment, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE
     )
@@ -54,7 +54,7 @@ async def started(
 
 
 async def stops(latest: Any, command: tuple[str, ...], environment: Mapping[str, str]) -> None:
-    """Check that a program stops the robot when something is near, and not before."""
+    """Check that a program stops the robot only if something is near."""
     async with started((*command, NOTHING_IS_NEAR), environment) as watching:
         assert watching.stdout
         lines = [await watching.stdout.readline() for _ in range(2)]  # of eleven scans
@@ -72,13 +72,13 @@ def over_dds(judge: Judge) -> dict[str, Any]:
     return {"transport": "dds", "domain": judge.domain, "localhost": True}
 
 
-def an_address() -> str:
+def free_address() -> str:
     return f"tcp/127.0.0.1:{free_port()}"
 
 
 @pytest.mark.slow
 async def test_a_node_in_rclpy_stops_the_robot(home: Home, judge: Judge, ros2: Path) -> None:
-    async with driving(home, an_address(), **over_dds(judge)) as latest:
+    async with driving(home, free_address(), **over_dds(judge)) as latest:
         await stops(latest, (str(ros2), str(EXAMPLES / "stop.py")), judge.environment())
 
 
@@ -91,13 +91,13 @@ async def test_a_node_in_javascript_stops_the_robot(
     program.write_text((EXAMPLES / "stop.mjs").read_text())
     (tmp_path / "node_modules").symlink_to(client.modules)
     environment = judge.environment() | client.environment
-    async with driving(home, an_address(), **over_dds(judge)) as latest:
+    async with driving(home, free_address(), **over_dds(judge)) as latest:
         await stops(latest, ("node", str(program)), environment)
 
 
 @pytest.mark.skipif(not PICO, reason="zenoh-pico is not here: set ZENOH_PICO to its folder")
 async def test_a_program_in_c_stops_the_robot(home: Home, tmp_path: Path) -> None:
-    program, router = str(tmp_path / "stop"), an_address()
+    program, router = str(tmp_path / "stop"), free_address()
     includes = [f"-I{PICO}/include", f"-I{PICO}/build/include"]
     flags = ("-std=c11", "-D_GNU_SOURCE", "-DZENOH_LINUX", "-Wall", "-Wextra", "-Werror")
     source, library = str(EXAMPLES / "stop.c"), f"{PICO}/build/lib/libzenohpico.a"

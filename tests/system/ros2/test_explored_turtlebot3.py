@@ -1,4 +1,4 @@
-"""Our brain explores rooms on a TurtleBot3 that rclpy plays, and reaches goals in them."""
+"""Our brain explores rooms with a TurtleBot3 simulated by rclpy, and reaches goals in them."""
 
 import asyncio
 import contextlib
@@ -21,13 +21,13 @@ from tests.system.ros2.test_gateway_ros import Robot, released
 from tests.system.ros2.test_ros2_body import ROOM, robot_file
 
 WALLS = [*ROOM, [1, -2, 1, 0.6], [2.5, 2, 2.5, -0.4]]  # three rooms in a row
-GOALS = ((3.2, 1.2), (1.8, -1.2), (-1.3, -1.3), (-1.3, 1.3))  # from where it began [m]
-LONGEST_S = 1200.0
-NEAR_M = 0.3  # by the truth: the planner stops within 0.25 m
+GOALS = ((3.2, 1.2), (1.8, -1.2), (-1.3, -1.3), (-1.3, 1.3))  # relative to the start [m]
+TIMEOUT_S = 1200.0
+NEAR_M = 0.3  # by the true pose; the planner stops within 0.25 m
 
 
 async def kept_enabled(robot: Robot) -> None:
-    """Enable the brain, and again where a busy machine has made the gate stop."""
+    """Enable the brain, and again if the gate of a busy machine has stopped it."""
     while True:
         if robot.now.gate.mode == "idle":
             with contextlib.suppress(GigabrainError):
@@ -37,7 +37,7 @@ async def kept_enabled(robot: Robot) -> None:
 
 
 async def succeeded(tasks: Tasks, send: Any) -> None:
-    """Carry out a task, which is refused until there is a map."""
+    """Send a task until it is accepted, which needs a map; wait for its success."""
     while True:
         with contextlib.suppress(GigabrainError):
             task: Task = await tasks.result(await send())
@@ -47,7 +47,7 @@ async def succeeded(tasks: Tasks, send: Any) -> None:
 
 
 @pytest.mark.slow
-async def test_a_turtlebot3_of_rclpy_is_explored_with_and_reaches_goals(
+async def test_our_brain_explores_with_a_turtlebot3_of_rclpy_and_reaches_goals(
     home: Home, judge: Judge, tmp_path: Path
 ) -> None:
     played = judge.start("turtlebot3", walls=WALLS, stamped=True)
@@ -59,7 +59,7 @@ async def test_a_turtlebot3_of_rclpy_is_explored_with_and_reaches_goals(
     )
     home.start("up", str(file))
     session = connect(endpoint_of(file), "test", timeout_s=None)
-    async with asyncio.timeout(LONGEST_S), session as bus:
+    async with asyncio.timeout(TIMEOUT_S), session as bus:
         robot, tasks = Robot(home, bus, ""), Tasks(bus)
         await until(lambda: robot.states, "states")
         async with asyncio.TaskGroup() as group:

@@ -1,4 +1,4 @@
-"""Our wire against other people's implementations, which know nothing of ours."""
+"""Our protocols against independent implementations."""
 
 import asyncio
 import json
@@ -42,7 +42,7 @@ def types() -> Types:
 
 
 class Sdk:
-    """A node of zenoh-ros2-sdk in a process of its own."""
+    """A node of zenoh-ros2-sdk in a separate process."""
 
     def __init__(self, process: asyncio.subprocess.Process) -> None:
         self.process = process
@@ -120,7 +120,7 @@ async def test_zenoh_ros2_sdk_reads_answers_and_calls(
     assert ours.counts.total() == 0
 
 
-def test_pamoja_makes_the_same_keys_and_refuses_the_same_names(types: Types) -> None:
+def test_pamoja_makes_the_same_keys_and_rejects_the_same_names(types: Types) -> None:
     topics = ["/scan", "/robot1/scan", "/a/b/c", "/a//b", "/1a", "/a/", "/a b", "/_hidden"]
     names = [STRING, "geometry_msgs/msg/Twist", "nav_msgs/msg/Odometry"]
     asked = [
@@ -148,7 +148,7 @@ def test_foxgloves_codec_reads_and_writes_the_same_values(types: Types) -> None:
     source = random.Random(5)
     cases = []
     for name in READ_IN_JAVASCRIPT:
-        fields = random_fields(types, name, source, texts=("", "map"))  # it cuts others short
+        fields = random_fields(types, name, source, texts=("", "map"))  # it truncates other texts
         message = types.from_dict(name, fields)
         cases.append((name, fields, message, types.encode(name, message)))
     asked = [

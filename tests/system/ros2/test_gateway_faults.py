@@ -1,4 +1,4 @@
-"""The process `ros2` frozen and killed while ROS drives: the body stops, nothing else notices."""
+"""The process `ros2` frozen and killed while ROS drives: the body stops, the rest works on."""
 
 import asyncio
 import contextlib
@@ -23,7 +23,7 @@ TWIST = "geometry_msgs/msg/Twist"
 
 
 class ZenohDriver:
-    """A node of `rmw_zenoh` that is asked as the program `drive` of rclpy is."""
+    """A node of `rmw_zenoh` with the same commands as the rclpy program `drive`."""
 
     def __init__(self, nodes: Nodes, node: Any) -> None:
         self._types, self._publisher = nodes.types, node.publisher("/cmd_vel", TWIST)
@@ -46,7 +46,7 @@ class ZenohDriver:
 async def driven(
     request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
 ) -> AsyncIterator[tuple[Robot, Any]]:
-    """A robot, and a node of ROS that can drive it."""
+    """Yield a robot, and a ROS node that can drive it."""
     judge: Judge | None = None
     if request.param == "dds":
         judge = request.getfixturevalue("shared_judge")
@@ -82,13 +82,13 @@ async def test_a_frozen_gateway_stops_the_body_and_its_backlog_moves_nothing(
     alive: list[Health] = []
     with frozen(gateway):
         await stopped(robot)
-        await asyncio.sleep(1.0)  # of commands that wait for it
+        await asyncio.sleep(1.0)  # commands queue up meanwhile
         await driver.query("rest")
         since = len(robot.states)
     robot.bus.subscribe(HEALTH, lambda _, health: alive.append(health), name="ros2")
     await until(lambda: len(alive) >= 3, "the gateway goes on")
-    assert {one.sent.linear_x for one in robot.states[since:]} == {0.0}
-    assert {one.gate.mode for one in robot.states[since:]} == {"idle"}
+    assert {each.sent.linear_x for each in robot.states[since:]} == {0.0}
+    assert {each.gate.mode for each in robot.states[since:]} == {"idle"}
     assert set(robot.home.processes()) == before
     await driving(robot, driver)
     assert robot.now.gate.enables > enables

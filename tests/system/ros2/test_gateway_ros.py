@@ -1,4 +1,4 @@
-"""A whole robot with the gateway in processes, and real ROS 2 over DDS that reads and drives it."""
+"""A whole robot with the gateway, in processes, read and driven by real ROS 2 over DDS."""
 
 import asyncio
 import contextlib
@@ -40,7 +40,7 @@ READ = {
 
 
 class Robot:
-    """A running robot as its own bus shows it."""
+    """A running robot, with the states from its bus."""
 
     def __init__(self, home: Home, bus: Any, router: str) -> None:
         self.home, self.bus, self.router = home, bus, router
@@ -53,13 +53,13 @@ class Robot:
         return self.states[-1]
 
     async def becomes(self, mode: str) -> None:
-        """Wait for a mode of the gate."""
+        """Wait until the gate has a mode."""
         await until(lambda: self.states and self.now.gate.mode == mode, mode)
 
 
 @contextlib.asynccontextmanager
 async def running(home: Home, judge: Judge | None, **parts: Any) -> AsyncIterator[Robot]:
-    """Yield a robot whose gateway joins the judge's domain; without one, its router is ROS's."""
+    """Yield a robot whose gateway joins the judge's domain; without a judge, its own router."""
     router = f"tcp/127.0.0.1:{free_port()}"
     parts = {"body": "turtlebot3_burger", "world": "arena"} | parts
     given: dict[str, Any] = {"transport": "rmw_zenoh"}
@@ -78,7 +78,7 @@ async def running(home: Home, judge: Judge | None, **parts: Any) -> AsyncIterato
 
 @pytest_asyncio.fixture(loop_scope="module", scope="module")
 async def robot(shared_home: Home, shared_judge: Judge) -> AsyncIterator[Robot]:
-    """A robot that the tests share; each has programs of its own."""
+    """A robot that the tests share; each test starts its own programs."""
     async with running(shared_home, shared_judge) as made:
         await made.becomes("latched")
         yield made
@@ -86,13 +86,13 @@ async def robot(shared_home: Home, shared_judge: Judge) -> AsyncIterator[Robot]:
 
 @pytest.fixture
 def judge(shared_judge: Judge) -> Iterator[Judge]:
-    """The domain that the tests share, without the programs of the test before."""
+    """The domain that the tests share; the programs end with the test."""
     yield shared_judge
     shared_judge.close()
 
 
 async def released(robot: Robot) -> None:
-    """Release the robot, once it has rested as long as that takes."""
+    """Release the robot, as soon as it has been at rest for long enough."""
     while robot.now.gate.mode == "latched":
         with contextlib.suppress(Refused, BodyLost):
             await release(robot.bus, robot.now.gate.estop_generation)
@@ -101,7 +101,7 @@ async def released(robot: Robot) -> None:
 
 
 async def driving(robot: Robot, driver: Any, **how: Any) -> None:
-    """Let a program drive; on a busy machine the gate may stop it, and it has to pause."""
+    """Let a program drive; if the gate of a busy machine stops it, pause and try again."""
     while True:
         await driver.query("drive", linear=0.15, hz=20.0, **how)
         with contextlib.suppress(TimeoutError):
@@ -112,7 +112,7 @@ async def driving(robot: Robot, driver: Any, **how: Any) -> None:
 
 
 async def diagnosed(judge: Judge) -> Callable[[str], str]:
-    """Return a function that gives the newest text of a line of /diagnostics, as rclpy has it."""
+    """Return a function that returns the newest text of a status in /diagnostics, by name."""
     listener = judge.start("listen", node="diagnosed")
     kind, qos = READ["/diagnostics"]
     await listener.query("subscribe", topic="/diagnostics", type=kind, qos=qos, stream=True)
@@ -120,13 +120,13 @@ async def diagnosed(judge: Judge) -> Callable[[str], str]:
     def text(name: str) -> str:
         received = listener.seen("message", topic="/diagnostics")
         lines = received[-1]["value"]["status"] if received else []
-        return next((one["message"] for one in lines if one["name"] == f"gigabrain: {name}"), "")
+        return next((each["message"] for each in lines if each["name"] == f"gigabrain: {name}"), "")
 
     return text
 
 
 def frames(transforms: Any) -> set[str]:
-    return {one["child_frame_id"] for one in transforms["transforms"]}
+    return {each["child_frame_id"] for each in transforms["transforms"]}
 
 
 def complete(report: Any) -> bool:
@@ -140,7 +140,7 @@ def complete(report: Any) -> bool:
     return "transforms" not in newest or len(frames(newest)) > 1
 
 
-async def test_rclpy_reads_topics_with_values_frames_and_qos(robot: Robot, judge: Judge) -> None:
+async def test_rclpy_receives_topics_with_values_frames_and_qos(robot: Robot, judge: Judge) -> None:
     listener = judge.start("listen")
     for topic, (kind, qos) in READ.items():
         await listener.query("subscribe", topic=topic, type=kind, qos=qos)
@@ -158,13 +158,13 @@ async def test_rclpy_reads_topics_with_values_frames_and_qos(robot: Robot, judge
     assert values["/joint_states"]["name"] == ["wheel_left_joint", "wheel_right_joint"]
     assert 0.0 < values["/battery_state"]["percentage"] <= 1.0
     assert values["/robot_description"]["data"].startswith("<?xml")
-    names = {one["name"] for one in values["/diagnostics"]["status"]}
+    names = {each["name"] for each in values["/diagnostics"]["status"]}
     assert {"gigabrain: gate", "gigabrain: safety", "gigabrain: cmd_vel"} <= names
     stamp, now = odom["header"]["stamp"], values["/clock"]["clock"]
     assert abs(stamp["sec"] - now["sec"]) <= 2
 
 
-async def test_rclpy_drives_by_cmd_vel_and_killed_the_body_stops(
+async def test_rclpy_drives_by_cmd_vel_and_the_body_stops_if_it_is_killed(
     robot: Robot, judge: Judge
 ) -> None:
     await released(robot)
@@ -177,9 +177,7 @@ async def test_rclpy_drives_by_cmd_vel_and_killed_the_body_stops(
     assert robot.now.gate.commander == ""
 
 
-async def test_a_stamped_twist_drives_and_one_with_an_old_stamp_is_refused_by_name(
-    robot: Robot, judge: Judge
-) -> None:
+async def test_a_stamped_twist_drives_unless_its_stamp_is_old(robot: Robot, judge: Judge) -> None:
     await released(robot)
     driver, text = judge.start("drive"), await diagnosed(judge)
     await driving(robot, driver, type=STAMPED)
@@ -191,7 +189,7 @@ async def test_a_stamped_twist_drives_and_one_with_an_old_stamp_is_refused_by_na
     await robot.becomes("idle")
 
 
-async def test_enable_lets_the_brain_drive_and_ros_is_refused_by_name(
+async def test_enable_lets_the_brain_drive_and_commands_of_ros_are_refused(
     robot: Robot, judge: Judge
 ) -> None:
     await released(robot)
@@ -201,7 +199,7 @@ async def test_enable_lets_the_brain_drive_and_ros_is_refused_by_name(
     while robot.now.gate.commander != "control":  # on a busy machine the gate may stop it
         name = f"enable-{len(caller.seen('response'))}"
         await caller.query("call", service="/enable", type=TRIGGER, name=name)
-        assert (await caller.hear("response", name=name))["value"]["success"]
+        assert (await caller.wait_async("response", name=name))["value"]["success"]
         count = len(robot.states)
         await until(lambda: len(robot.states) > count + 10, "states")  # noqa: B023
     await driver.query("drive", linear=0.15)
@@ -212,41 +210,41 @@ async def test_enable_lets_the_brain_drive_and_ros_is_refused_by_name(
     await robot.becomes("latched")
 
 
-async def test_rclpy_stops_by_service_and_releases_by_another(robot: Robot, judge: Judge) -> None:
+async def test_rclpy_stops_and_releases_by_services(robot: Robot, judge: Judge) -> None:
     await released(robot)
     driver, caller = judge.start("drive"), judge.start("call", node="caller")
     await driving(robot, driver)
     await caller.available(service="/estop", type=SET_BOOL)
     await caller.query("call", service="/estop", type=SET_BOOL, data=True)
-    response = await caller.hear("response", service="/estop")
+    response = await caller.wait_async("response", service="/estop")
     assert response["value"]["success"]
     await until(lambda: robot.now.gate.mode == "latched", "it is latched")
     await until(lambda: robot.now.velocity.linear_x < 0.01, "it stands")
     await caller.query("call", service="/estop", type=SET_BOOL, data=False, name="undo")
-    refused = await caller.hear("response", name="undo")
+    refused = await caller.wait_async("response", name="undo")
     assert not refused["value"]["success"]
     await driver.query("rest")
     await asyncio.sleep(1.0)
     await caller.available(service="/release", type=TRIGGER)
     await caller.query("call", service="/release", type=TRIGGER)
-    response = await caller.hear("response", service="/release")
+    response = await caller.wait_async("response", service="/release")
     assert response["value"]["success"], response
     await robot.becomes("idle")
 
 
-async def test_a_killed_gateway_costs_the_robot_nothing_and_ros_finds_it_again(
+async def test_a_killed_gateway_does_not_disturb_the_robot_and_ros_finds_it_again(
     robot: Robot, judge: Judge
 ) -> None:
     listener = judge.start("listen")
     kind, qos = READ["/odom"]
     await listener.query("subscribe", topic="/odom", type=kind, qos=qos)
-    await asyncio.to_thread(listener.poll, "report", lambda one: one["count"] > 5, topic="/odom")
+    await asyncio.to_thread(listener.poll, "report", lambda each: each["count"] > 5, topic="/odom")
     (before,) = robot.home.processes("ros2")
     others = set(robot.home.processes()) - {before}
     os.kill(before, signal.SIGKILL)
     await until(lambda: robot.home.processes("ros2") not in ([], [before]), "it is restarted")
     count = (await listener.query("report", topic="/odom"))["count"]
     await asyncio.to_thread(
-        listener.poll, "report", lambda one: one["count"] > count + 20, topic="/odom"
+        listener.poll, "report", lambda each: each["count"] > count + 20, topic="/odom"
     )
     assert others <= set(robot.home.processes())

@@ -1,4 +1,4 @@
-"""The judge by itself: rclpy programs see each other, and nothing of them is left."""
+"""Tests of the judge itself: rclpy programs find each other, and leave no process behind."""
 
 import os
 
@@ -11,7 +11,7 @@ NAVIGATE = {"action": "/navigate_to_pose", "type": "nav2_msgs/action/NavigateToP
 SERVICE = {"service": "/estop", "type": "std_srvs/srv/SetBool"}
 
 
-def test_two_programs_meet_with_values_rates_and_endpoints(judge: Judge) -> None:
+def test_a_program_receives_values_of_another_with_rates_and_endpoints(judge: Judge) -> None:
     listen = judge.start("listen", node="ears")
     listen.ask("subscribe", topic="/cmd_vel", type=TWIST, qos={"depth": 5})
     drive = judge.start("drive", node="hands", namespace="/left")
@@ -27,7 +27,7 @@ def test_two_programs_meet_with_values_rates_and_endpoints(judge: Judge) -> None
     assert (subscriber["node"], subscriber["reliable"]) == ("ears", True)
 
 
-def test_a_service_answers_with_values_and_a_time(judge: Judge) -> None:
+def test_a_service_call_reports_values_and_duration(judge: Judge) -> None:
     serve = judge.start("serve")
     serve.ask("service", **SERVICE, success=True, message="stopped")
     call = judge.start("call", node="caller")
@@ -77,7 +77,7 @@ def test_the_graph_names_nodes_topics_and_services(judge: Judge) -> None:
     assert found["topics"]["/rosout"] == ["rcl_interfaces/msg/Log"]
 
 
-def test_the_codec_goes_both_ways_and_knows_generated_types(judge: Judge) -> None:
+def test_the_codec_serialises_and_deserialises_generated_types(judge: Judge) -> None:
     codec = judge.start("codec")
     hashes = codec.ask("hashes")["hashes"]
     assert hashes["std_msgs/msg/String"].startswith("RIHS01_df668c74")
@@ -106,7 +106,7 @@ def test_a_killed_program_is_reaped_and_a_frozen_one_is_silent(judge: Judge) -> 
         os.kill(drive.pid, 0)
 
 
-def test_a_judge_leaves_no_process_behind_be_it_frozen(judge: Judge) -> None:
+def test_a_judge_leaves_no_process_behind_even_if_frozen(judge: Judge) -> None:
     programs = [judge.start("drive"), judge.start("listen")]
     with programs[0].frozen():
         judge.close()
@@ -115,13 +115,13 @@ def test_a_judge_leaves_no_process_behind_be_it_frozen(judge: Judge) -> None:
             os.kill(program.pid, 0)
 
 
-def test_a_command_that_cannot_be_obeyed_names_its_error(judge: Judge) -> None:
+def test_a_failed_command_ends_the_program_with_its_error(judge: Judge) -> None:
     listen = judge.start("listen")
     with pytest.raises(Ended, match="no_such_msgs"):
         listen.ask("subscribe", topic="/a", type="no_such_msgs/msg/A", qos={})
 
 
-def test_domains_are_claimed_once_and_used_ones_are_not_free(judge: Judge) -> None:
+def test_a_domain_is_claimed_only_once_and_not_if_in_use(judge: Judge) -> None:
     with free_domain() as first, free_domain() as second:
         assert len({first, second, judge.domain}) == 3
     judge.start("graph")

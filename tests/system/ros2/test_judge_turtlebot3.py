@@ -1,4 +1,4 @@
-"""The TurtleBot3 that rclpy plays behaves as the real one, with its node killed and frozen too."""
+"""The simulated TurtleBot3 behaves as the real one, even if its node is killed or frozen."""
 
 import math
 import os
@@ -28,7 +28,7 @@ def moving(robot: Program) -> Event:
     return robot.poll("truth", lambda truth: truth["speed_mps"] > 0.19)
 
 
-def test_it_publishes_what_a_turtlebot3_does(judge: Judge) -> None:
+def test_it_publishes_the_topics_of_a_turtlebot3(judge: Judge) -> None:
     judge.start("turtlebot3", walls=ROOM, start=[0.0, 0.0, math.pi / 2])
     listen = listening(
         judge,
@@ -42,7 +42,7 @@ def test_it_publishes_what_a_turtlebot3_does(judge: Judge) -> None:
     )
     scan = newest(listen, "/scan")
     assert (scan["header"]["frame_id"], len(scan["ranges"])) == ("base_scan", 230)
-    # the lidar sits 32 mm behind the middle of a robot that looks at the wall 1 m ahead
+    # the lidar is 32 mm behind the middle of the robot, which faces a wall 1 m ahead
     assert scan["ranges"][0] == pytest.approx(1.032, abs=2e-3)
     assert scan["ranges"][115] == pytest.approx(0.968, abs=2e-3)
     odom = newest(listen, "/odom")
@@ -53,16 +53,16 @@ def test_it_publishes_what_a_turtlebot3_does(judge: Judge) -> None:
     joints = newest(listen, "/joint_states")
     assert joints["name"] == ["wheel_left_joint", "wheel_right_joint"]
     transforms = newest(listen, "/tf")["transforms"] + newest(listen, "/tf_static")["transforms"]
-    pairs = {(one["header"]["frame_id"], one["child_frame_id"]) for one in transforms}
+    pairs = {(each["header"]["frame_id"], each["child_frame_id"]) for each in transforms}
     assert {("odom", "base_footprint"), ("base_link", "base_scan")} <= pairs
 
 
-def test_it_drives_as_commanded_and_counts_it(judge: Judge) -> None:
+def test_it_drives_as_commanded_and_measures_it(judge: Judge) -> None:
     robot = judge.start("turtlebot3", walls=ROOM)
     drive = judge.start("drive")
     drive.ask("drive", linear=0.209)
     truth = robot.poll("truth", lambda truth: truth["pose"][0] > 0.3)
-    assert truth["speed_mps"] == pytest.approx(0.20)  # cut to hundredths
+    assert truth["speed_mps"] == pytest.approx(0.20)  # truncated to hundredths
     drive.ask("rest")
     drive.ask("drive", linear=0.0, angular=1.0)
     robot.poll("truth", lambda truth: truth["pose"][2] > 1.0)
@@ -74,7 +74,7 @@ def test_it_drives_as_commanded_and_counts_it(judge: Judge) -> None:
     assert truth["contacts"] == 0
 
 
-def test_a_wall_stops_it_and_is_counted(judge: Judge) -> None:
+def test_a_wall_stops_it_and_counts_as_a_contact(judge: Judge) -> None:
     robot = judge.start("turtlebot3", walls=[[0.3, -1, 0.3, 1]])
     judge.start("drive").ask("drive", linear=0.2)
     truth = robot.poll("truth", lambda found: found["contacts"])
@@ -110,7 +110,7 @@ def test_a_frozen_node_stops_it_until_the_next_command(judge: Judge) -> None:
 
 
 @pytest.mark.slow
-def test_two_robots_with_namespaces_share_a_world_of_topics(judge: Judge) -> None:
+def test_two_robots_with_namespaces_have_separate_topics(judge: Judge) -> None:
     left = judge.start("turtlebot3", namespace="/left", stamped=True)
     judge.start("turtlebot3", namespace="/right")
     drive = judge.start("drive")

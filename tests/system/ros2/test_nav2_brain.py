@@ -1,4 +1,4 @@
-"""A robot whose brain is Nav2."""
+"""A robot without our brain, for use with Nav2."""
 
 import asyncio
 
@@ -9,10 +9,12 @@ from tests.places import ROOT
 from tests.ros2.judge import Judge
 from tests.system.ros2.test_gateway_ros import READ, driving, released, running
 
-OF_NAV2 = ("/map", "/plan", "/goal_pose", "/initialpose", "/navigate_to_pose/_action/status")
+NAV2_TOPICS = ("/map", "/plan", "/goal_pose", "/initialpose", "/navigate_to_pose/_action/status")
 
 
-async def test_a_robot_without_a_brain_leaves_nav2_its_names(home: Home, judge: Judge) -> None:
+async def test_a_robot_without_a_brain_does_not_use_the_names_of_nav2(
+    home: Home, judge: Judge
+) -> None:
     parts = yaml.safe_load((ROOT / "examples/ros2/nav2.yaml").read_text())
     async with running(home, judge, **parts) as robot:
         listener, driver = judge.start("listen", node="listener"), judge.start("drive")
@@ -22,12 +24,12 @@ async def test_a_robot_without_a_brain_leaves_nav2_its_names(home: Home, judge: 
         await driving(robot, driver)
         assert robot.now.gate.commander == "ros2"
         report = await asyncio.to_thread(
-            listener.poll, "report", lambda one: one["count"] > 0, topic="/tf"
+            listener.poll, "report", lambda each: each["count"] > 0, topic="/tf"
         )
-        parents = {one["header"]["frame_id"] for one in report["values"][-1]["transforms"]}
+        parents = {each["header"]["frame_id"] for each in report["values"][-1]["transforms"]}
         assert parents == {"odom", "base_link"}
         received = (await listener.endpoints("/cmd_vel"))["subscribers"]
-        assert {one["node"] for one in received} == {"gigabrain"}
-        for topic in OF_NAV2:
+        assert {each["node"] for each in received} == {"gigabrain"}
+        for topic in NAV2_TOPICS:
             found = await listener.endpoints(topic)
             assert (topic, found["publishers"], found["subscribers"]) == (topic, [], [])

@@ -1,4 +1,4 @@
-"""A robot that makes a map and carries out what rclpy sends as Nav2's clients and RViz do."""
+"""A robot that makes a map, and carries out goals of rclpy as from Nav2's clients and RViz."""
 
 import asyncio
 from collections.abc import AsyncIterator, Callable
@@ -28,7 +28,7 @@ TO_POSE = {"action": "/navigate_to_pose", "type": "nav2_msgs/action/NavigateToPo
 THROUGH = {"action": "/navigate_through_poses", "type": "nav2_msgs/action/NavigateThroughPoses"}
 POSE, PATH = "geometry_msgs/msg/PoseStamped", "nav_msgs/msg/Path"
 GUESS, MAP = "geometry_msgs/msg/PoseWithCovarianceStamped", "nav_msgs/msg/OccupancyGrid"
-LONGEST_S = 120.0  # of a goal
+GOAL_TIMEOUT_S = 120.0
 
 
 @pytest_asyncio.fixture(loop_scope="module", scope="module")
@@ -51,16 +51,16 @@ def pose_at(x: float, y: float, frame: str = "map") -> dict[str, Any]:
 async def send(client: Program, where: dict[str, str], name: str, **goal: Any) -> None:
     await client.available(**where)
     await client.query("send", **where, name=name, goal=goal)
-    await client.hear("accepted", name=name)
+    await client.wait_async("accepted", name=name)
 
 
 async def result(client: Program, name: str) -> tuple[str, int]:
-    found = await client.hear("result", LONGEST_S, name=name)
+    found = await client.wait_async("result", GOAL_TIMEOUT_S, name=name)
     return found["status"], found["value"]["error_code"]
 
 
 async def mapped(client: Program) -> None:
-    """Send goals until one is refused as outside of the map, which there is not at first."""
+    """Wait for a map: send goals outside until one is aborted for that reason."""
     found, tries = ("", 0), 0
     while found != ("aborted", 204):
         await send(client, TO_POSE, f"early-{tries}", pose=pose_at(50.0, 50.0))
@@ -74,7 +74,7 @@ async def test_goals_are_followed_cancelled_and_preempted(robot: Robot, judge: J
     await send(client, TO_POSE, "frame", pose=pose_at(0.0, 0.0, "somewhere"))
     assert await result(client, "frame") == ("aborted", 9002)
     await send(client, TO_POSE, "far", pose=pose_at(0.6, 0.0))
-    feedback = await client.hear("feedback", name="far")
+    feedback = await client.wait_async("feedback", name="far")
     assert feedback["value"]["current_pose"]["header"]["frame_id"] == "map"
     await send(client, TO_POSE, "back", pose=pose_at(-0.4, 0.0))
     assert await result(client, "far") == ("aborted", 0)
@@ -85,24 +85,24 @@ async def test_goals_are_followed_cancelled_and_preempted(robot: Robot, judge: J
 
 
 @pytest.mark.slow
-async def test_a_goal_through_poses_is_followed_and_keeps_the_other_action_out(
+async def test_while_a_goal_through_poses_is_followed_other_goals_are_rejected(
     robot: Robot, judge: Judge
 ) -> None:
     client = judge.start("navigate")
     await mapped(client)
     poses = [pose_at(0.6, 0.0), pose_at(0.0, 0.0)]
     await send(client, THROUGH, "round", poses=poses)
-    first = (await client.hear("feedback", name="round"))["value"]
+    first = (await client.wait_async("feedback", name="round"))["value"]
     assert first["number_of_poses_remaining"] == 2
     await client.query("send", **TO_POSE, name="other", goal={"pose": pose_at(0.2, 0.0)})
-    await client.hear("rejected", name="other")
+    await client.wait_async("rejected", name="other")
     assert await result(client, "round") == ("succeeded", 0)
     last = client.seen("feedback", name="round")[-1]["value"]
     assert last["number_of_poses_remaining"] == 1
     await send(client, THROUGH, "nowhere", poses=[pose_at(50.0, 50.0)])
     assert await result(client, "nowhere") == ("aborted", 304)
     await send(client, THROUGH, "again", poses=poses)
-    await client.hear("feedback", name="again")
+    await client.wait_async("feedback", name="again")
     await client.query("cancel", name="again")
     assert await result(client, "again") == ("canceled", 0)
 
@@ -110,7 +110,7 @@ async def test_a_goal_through_poses_is_followed_and_keeps_the_other_action_out(
 async def published(
     judge: Judge, topic: str, kind: str, value: dict[str, Any], effect: Callable[[], object]
 ) -> None:
-    """Publish a message until it has its effect; the first ones come before the reader is found."""
+    """Publish a message until it has its effect; the first ones may have no reader yet."""
     sender = judge.start("drive", node="rviz")
     async with asyncio.timeout(PATIENCE_S):
         while not effect():
@@ -119,7 +119,7 @@ async def published(
 
 
 @pytest.mark.slow
-async def test_a_goal_pose_of_rviz_has_a_plan_and_a_wrong_one_is_named(
+async def test_a_goal_pose_of_rviz_gets_a_plan_and_a_wrong_one_is_reported(
     robot: Robot, judge: Judge
 ) -> None:
     await mapped(judge.start("navigate"))
@@ -127,9 +127,9 @@ async def test_a_goal_pose_of_rviz_has_a_plan_and_a_wrong_one_is_named(
     await listener.query("subscribe", topic="/plan", type=PATH, qos={}, stream=True)
 
     def planned() -> bool:
-        received = [one["value"] for one in listener.seen("message", topic="/plan")]
+        received = [each["value"] for each in listener.seen("message", topic="/plan")]
         ends = [path["poses"][-1] for path in received if path["poses"]]
-        places = [(one["header"]["frame_id"], one["pose"]["position"]) for one in ends]
+        places = [(each["header"]["frame_id"], each["pose"]["position"]) for each in ends]
         return any(
             frame == "map" and abs(at["x"] - 0.5) < 0.1 and abs(at["y"] - 0.1) < 0.1
             for frame, at in places
@@ -144,30 +144,30 @@ async def test_a_goal_pose_of_rviz_has_a_plan_and_a_wrong_one_is_named(
 async def test_an_initialpose_of_rviz_reaches_the_map_maker(robot: Robot, judge: Judge) -> None:
     await mapped(judge.start("navigate"))
     accepted: list[AcceptedRequest] = []
-    robot.bus.subscribe(REQUEST_LOG, lambda _, one: accepted.append(one))
+    robot.bus.subscribe(REQUEST_LOG, lambda _, each: accepted.append(each))
     text, guess = await diagnosed(judge), {"pose": pose_at(0.0, 0.0)["pose"]}
     wrong = {"header": {"frame_id": "odom"}, "pose": guess}
     await published(judge, "/initialpose", GUESS, wrong, lambda: "'odom'" in text("initialpose"))
     right = {"header": {"frame_id": "map"}, "pose": guess}
 
     def taken() -> bool:
-        return POSE_SET.key in [one.service for one in accepted]
+        return POSE_SET.key in [each.service for each in accepted]
 
     await published(judge, "/initialpose", GUESS, right, taken)
 
 
 @pytest.mark.slow
-async def test_the_map_is_saved_and_read_by_those_who_come_late(robot: Robot, judge: Judge) -> None:
+async def test_the_map_is_saved_and_received_by_late_readers(robot: Robot, judge: Judge) -> None:
     await mapped(judge.start("navigate"))
     caller, listener = judge.start("call"), judge.start("listen")
     where = {"service": "/map_save", "type": TRIGGER}
     await caller.available(**where)
     await caller.query("call", **where)
-    response = (await caller.hear("response", service="/map_save"))["value"]
+    response = (await caller.wait_async("response", service="/map_save"))["value"]
     assert (response["success"], "ros2-" in response["message"]) == (True, True)
     await listener.query("subscribe", topic="/map", type=MAP, qos=LATCHED)
     report = await asyncio.to_thread(
-        listener.poll, "report", lambda one: one["count"] > 0, topic="/map"
+        listener.poll, "report", lambda each: each["count"] > 0, topic="/map"
     )
     grid = report["values"][-1]
     assert grid["header"]["frame_id"] == "map"
@@ -176,7 +176,7 @@ async def test_the_map_is_saved_and_read_by_those_who_come_late(robot: Robot, ju
     assert min(known) < 25 < 75 < max(known)
 
 
-async def test_with_take_cmd_vel_drives_in_place_of_the_brain(robot: Robot, judge: Judge) -> None:
+async def test_with_take_cmd_vel_takes_the_body_from_the_brain(robot: Robot, judge: Judge) -> None:
     await until(lambda: robot.now.gate.commander == "control", "the brain drives")
     driver = judge.start("drive")
     await driving(robot, driver, angular=0.5)

@@ -1,4 +1,4 @@
-"""A robot of Open-RMF: a client with the libraries of its adapter, written from its source."""
+"""A robot driven by Open-RMF: a client with its adapter's libraries, after its source."""
 
 import asyncio
 import contextlib
@@ -35,20 +35,20 @@ CONFIG: dict[str, Any] = {"mode": "client", "scouting": {"multicast": {"enabled"
 
 
 class Adapter:
-    """The client, in a process of its own."""
+    """The client, in a separate process."""
 
     def __init__(self, process: asyncio.subprocess.Process) -> None:
         self._process = process
 
     async def call(self, *line: Any) -> Any:
-        """Return what it answers."""
+        """Send a call; return its answer."""
         assert self._process.stdin
         assert self._process.stdout
         self._process.stdin.write(json.dumps(line).encode() + b"\n")
         return json.loads(await self._process.stdout.readline())
 
     async def poll(self, name: str, done: Callable[[Any], bool]) -> Any:
-        """Call again and again until the answer is as wanted, and return it."""
+        """Repeat a call until `done` accepts its answer; return the answer."""
         async with asyncio.timeout(120):
             while True:
                 if done(found := await self.call(name)):
@@ -56,11 +56,11 @@ class Adapter:
                 await asyncio.sleep(0.05)
 
     async def next(self, name: str) -> Any:
-        """Return the first answer that there is."""
+        """Repeat a call until it has an answer; return it."""
         return await self.poll(name, lambda found: found is not None)
 
     async def end(self) -> Any:
-        """Return the status with which the present goal ends."""
+        """Wait for the end of the present goal; return its status."""
         return await self.poll("status", lambda found: found not in ACTIVE)
 
 
@@ -73,7 +73,7 @@ def interpreter() -> Path:
 async def adapter(
     interpreter: Path, folder: Path, config: dict[str, Any]
 ) -> AsyncIterator[Adapter]:
-    """Yield a client that takes the robot for `red`."""
+    """Yield a client for the robot `red`."""
     file = folder / "open_rmf.json5"
     file.write_text(json.dumps(CONFIG | config))
     process = await asyncio.create_subprocess_exec(
@@ -92,14 +92,14 @@ async def adapter(
 
 
 async def refused(rmf: Adapter) -> None:
-    """Send garbage to each service, which answers why it refuses that."""
+    """Send malformed requests to each service; check the error texts."""
     for name in ("send_goal", "get_result", "cancel_goal"):
         for payload in ("", "00010000ff", "0001000001" + "00" * 70_000):
             assert await rmf.call("garbage", name, payload) not in ("", "no answer")
 
 
 async def sent(rmf: Adapter, begin: list[float], x: float, y: float) -> None:
-    """Send a goal at (x, y) from where the robot began, and again if there is no map yet."""
+    """Send a goal at (x, y) relative to the start, again while there is no map."""
     while True:
         assert await rmf.call("navigate", begin[0] + x, begin[1] + y) is True
         while (status := await rmf.call("status")) in ACTIVE:
@@ -136,7 +136,7 @@ async def test_open_rmf_sends_follows_and_cancels_goals_and_reads_battery_and_po
 
         await refused(rmf)
         await until(lambda: healths and healths[-1].counters.get("free_fleet_refused") == 9)
-        assert await rmf.call("stop") == 0  # there was nothing to cancel
+        assert await rmf.call("stop") == 0  # with no goal to cancel
         assert abs(states[-1].velocity.linear_x) < 0.01
 
         await sent(rmf, begin, 0.6, 0.0)
@@ -197,7 +197,7 @@ async def test_with_keys_the_identity_of_a_dispatcher_is_enough(
             await reading
             assert charge == [0.75]
             assert await rmf.call("navigate", 1.0, 0.0) is True
-            assert await rmf.end() == ABORTED  # nothing here serves goals
+            assert await rmf.end() == ABORTED  # there is no server of goals
             assert await rmf.call("stop") == 0
         running.cancel()
         await asyncio.wait((running,))

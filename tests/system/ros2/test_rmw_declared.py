@@ -1,4 +1,4 @@
-"""Zenoh declarations as `rmw_zenoh` makes them, in a process of their own."""
+"""Zenoh declarations of `rmw_zenoh`, in a separate process, because they could hang."""
 
 import subprocess
 import sys

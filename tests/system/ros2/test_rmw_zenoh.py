@@ -1,4 +1,4 @@
-"""Tests of `rmw_zenoh` alone: our nodes, and bare Zenoh sessions in place of others."""
+"""Tests of `rmw_zenoh`: our nodes, and plain Zenoh sessions as other nodes."""
 
 import asyncio
 from collections.abc import AsyncIterator, Callable
@@ -32,7 +32,7 @@ async def nodes() -> AsyncIterator[ZenohNodes]:
         yield made
 
 
-async def test_the_wire_is_that_of_rmw_zenoh(nodes: ZenohNodes) -> None:
+async def test_keys_and_bytes_are_those_of_rmw_zenoh(nodes: ZenohNodes) -> None:
     samples: list[zenoh.Sample] = []
     session = nodes.net.raw()
     session.declare_subscriber("0/**", samples.append)
@@ -54,7 +54,7 @@ async def test_the_wire_is_that_of_rmw_zenoh(nodes: ZenohNodes) -> None:
     assert tokens == {node.token, made}
 
 
-async def test_without_a_reader_there_is_none_from_the_start(nodes: ZenohNodes) -> None:
+async def test_a_new_publisher_without_a_reader_counts_none(nodes: ZenohNodes) -> None:
     told: list[int] = []
     talker = await nodes.node("talker")
     publisher = talker.publisher("/chatter", STRING, on_readers=told.append)
@@ -63,7 +63,7 @@ async def test_without_a_reader_there_is_none_from_the_start(nodes: ZenohNodes) 
     assert (publisher.readers, latched.readers, told) == (0, 0, [])
 
 
-async def test_a_volatile_reader_gets_what_a_latched_topic_sends_now(
+async def test_a_volatile_reader_receives_new_messages_of_a_latched_topic(
     nodes: ZenohNodes,
 ) -> None:
     publisher = (await nodes.node("talker")).publisher("/map", STRING, LATCHED)
@@ -74,7 +74,7 @@ async def test_a_volatile_reader_gets_what_a_latched_topic_sends_now(
     assert {nodes.text(each.payload) for each in got} == {"map"}
 
 
-async def test_a_service_answers_and_correlates(nodes: ZenohNodes) -> None:
+async def test_each_response_of_a_service_belongs_to_its_request(nodes: ZenohNodes) -> None:
     server, client = await nodes.node("server"), await nodes.node("client")
 
     async def answer(request: bytes) -> bytes:
@@ -132,7 +132,7 @@ async def test_a_reply_carries_the_attachment_of_its_request(nodes: ZenohNodes) 
     assert attachment.source_ns > 0
 
 
-async def test_messages_without_a_good_attachment_count_and_arrive(
+async def test_messages_without_a_valid_attachment_are_counted_and_delivered(
     nodes: ZenohNodes,
 ) -> None:
     listener = await nodes.node("listener")
@@ -172,7 +172,7 @@ async def test_a_malformed_token_is_counted(nodes: ZenohNodes) -> None:
     assert node.endpoints() == ()
 
 
-async def test_another_domain_is_another_world(nodes: ZenohNodes) -> None:
+async def test_nodes_of_different_domains_do_not_communicate(nodes: ZenohNodes) -> None:
     talker, listener = await nodes.node("talker", domain=1), await nodes.node("listener", domain=2)
     other = await nodes.node("other", domain=1)
     got: list[Received] = []
@@ -186,7 +186,7 @@ async def test_another_domain_is_another_world(nodes: ZenohNodes) -> None:
     assert got == []
 
 
-async def test_humble_meets_humble_only(nodes: ZenohNodes) -> None:
+async def test_humble_communicates_only_with_humble(nodes: ZenohNodes) -> None:
     humble = await nodes.node("humble", distro="humble")
     jazzy, old = await nodes.node("jazzy"), await nodes.node("old", distro="humble")
     got: list[Received] = []
@@ -230,7 +230,7 @@ async def test_an_action_is_served(nodes: ZenohNodes) -> None:
     await server.close()
 
 
-async def test_all_is_found_again_after_the_routers_restart() -> None:
+async def test_nodes_find_each_other_again_after_a_restart_of_the_router() -> None:
     async with robot() as net:
         nodes = ZenohNodes(net)
         async with nodes.stack:
@@ -259,16 +259,14 @@ async def test_without_a_router_the_error_names_the_option() -> None:
         RmwZenohTransport(Ros2Link(), types())
 
 
-async def test_a_closed_node_keeps_no_publisher_that_a_callback_could_drop(
-    nodes: ZenohNodes,
-) -> None:
+async def test_a_closed_node_keeps_no_publisher(nodes: ZenohNodes) -> None:
     async with nodes.opened("talker") as node:
         publisher = node.publisher("/map", STRING, LATCHED)
         assert publisher._put
     assert publisher._put is None
 
 
-async def test_a_router_that_is_not_there_is_named_and_waited_for(
+async def test_a_missing_router_is_reported_and_waited_for(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     monkeypatch.setattr(rmw_zenoh, "WARN_AFTER_S", 0.05)

@@ -1,4 +1,4 @@
-"""A TurtleBot3 that rclpy plays, worn as a body: its node killed and frozen while it drives."""
+"""A TurtleBot3 simulated by rclpy as a body; its node is killed and frozen while it drives."""
 
 import asyncio
 import os
@@ -33,7 +33,7 @@ asyncio.run(main())
 
 
 def robot_file(judge: Judge, folder: Path, *, humble: bool = False) -> Path:
-    """The shipped TurtleBot3, in the judge's domain; or one that takes Twist and has frames."""
+    """Write a file of the shipped TurtleBot3 in the judge's domain; `humble`: with Twist and TF."""
     text = catalog.robot_path("turtlebot3_ros2").read_text()
     text = text.replace("domain: 30", f"localhost: true\n  domain: {judge.domain}")
     if humble:
@@ -45,7 +45,7 @@ def robot_file(judge: Judge, folder: Path, *, humble: bool = False) -> Path:
 
 
 class Session:
-    """A driver whose process ticks: it reads a state, and commands `wanted`, each 20 ms."""
+    """Runs a driver as its process does: every 20 ms, it reads a state and commands `wanted`."""
 
     def __init__(self, file: Path) -> None:
         _, driver = catalog.make_driver(str(file), Run(folder=file.parent, link="real"))
@@ -91,12 +91,14 @@ async def moving(robot: Program, it: Session) -> None:
 
 
 async def standing(robot: Program) -> None:
-    """Wait until it stands; without a stop it would go on with the last command."""
+    """Wait until it is at rest; without a stop it would continue with the last command."""
     await asyncio.to_thread(robot.poll, "truth", lambda now: now["speed_mps"] < 0.005)
 
 
 @pytest.mark.parametrize("humble", [False, True])
-async def test_it_is_driven_and_measured(judge: Judge, tmp_path: Path, humble: bool) -> None:
+async def test_the_robot_is_driven_and_its_motion_measured(
+    judge: Judge, tmp_path: Path, humble: bool
+) -> None:
     robot = judge.start("turtlebot3", walls=ROOM, stamped=not humble)
     async with Session(robot_file(judge, tmp_path, humble=humble)) as it:
         await it.found()
@@ -114,9 +116,11 @@ async def test_it_is_driven_and_measured(judge: Judge, tmp_path: Path, humble: b
 
 
 @pytest.mark.parametrize("fault", ["killed", "frozen"])
-async def test_its_node_fails_while_it_drives(judge: Judge, tmp_path: Path, fault: str) -> None:
+async def test_a_failure_of_the_robots_node_while_driving_stops_it(
+    judge: Judge, tmp_path: Path, fault: str
+) -> None:
     robot = judge.start("turtlebot3", walls=ROOM, stamped=True)
-    node = (await robot.hear("node"))["pid"]
+    node = (await robot.wait_async("node"))["pid"]
     async with Session(robot_file(judge, tmp_path)) as it:
         await it.found()
         await moving(robot, it)
@@ -128,7 +132,7 @@ async def test_its_node_fails_while_it_drives(judge: Judge, tmp_path: Path, faul
             with frozen(node):
                 await asyncio.gather(it.lost(), standing(robot))
                 it.wanted = 0.0
-                await asyncio.sleep(1.0)  # what it finds in its queue is zero
+                await asyncio.sleep(1.0)  # then its queue contains only zeros
         assert it.driver.problem
         it.wanted = 0.0
         await it.found()
@@ -137,7 +141,7 @@ async def test_its_node_fails_while_it_drives(judge: Judge, tmp_path: Path, faul
         await moving(robot, it)
 
 
-async def test_a_killed_driver_is_replaced_by_its_guard(judge: Judge, tmp_path: Path) -> None:
+async def test_the_guard_stops_the_robot_of_a_killed_driver(judge: Judge, tmp_path: Path) -> None:
     robot = judge.start("turtlebot3", walls=ROOM, stamped=True)
     file = robot_file(judge, tmp_path)
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
@@ -163,7 +167,7 @@ cat > /dev/null
 
 
 class SetClock(Clock):
-    """A clock that the test sets."""
+    """A clock whose time the test sets."""
 
     ns = 0
 
@@ -171,7 +175,7 @@ class SetClock(Clock):
         return self.ns
 
 
-async def test_a_guard_that_starts_slowly_is_not_started_again(
+async def test_a_slowly_starting_guard_is_not_restarted(
     judge: Judge, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     program = tmp_path / "guard"
@@ -196,17 +200,17 @@ async def test_a_guard_that_starts_slowly_is_not_started_again(
     process = guard._process
     assert process
     await guard.close()
-    assert process.returncode == 0  # waited for
+    assert process.returncode == 0  # its end was waited for
 
 
 @pytest.mark.slow
-async def test_bringup_finds_it_whole_or_names_the_wrong_type(judge: Judge, tmp_path: Path) -> None:
-    judge.start("turtlebot3", walls=ROOM)  # which takes Twist, as on Humble
+async def test_bringup_finds_no_fault_or_names_the_wrong_type(judge: Judge, tmp_path: Path) -> None:
+    judge.start("turtlebot3", walls=ROOM)  # it takes Twist, as on Humble
     file = robot_file(judge, tmp_path)
     found = await ros2_bringup.check(str(file), "real", tmp_path, 6.0)
-    wrong = [one for one in found if one.verdict == "error"]
-    assert [one.what for one in wrong] == ["/cmd_vel"]
+    wrong = [each for each in found if each.verdict == "error"]
+    assert [each.what for each in wrong] == ["/cmd_vel"]
     assert wrong[0].do == "write topics: {command: {type: geometry_msgs/msg/Twist}}"
-    frames = [one.text for one in found if one.what == "scan frame"]
+    frames = [each.text for each in found if each.what == "scan frame"]
     assert frames
     assert "x -0.032 m" in frames[0]

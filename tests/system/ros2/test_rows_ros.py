@@ -1,6 +1,6 @@
 """Every topic and parameter of the gateway, read by real ROS 2: values, frames, stamps, QoS, hash.
 
-The robot is played here, so that each value is known, and a body has all that any body may have.
+The robot is simulated here, so that each value is known, and a body has all that any body may have.
 """
 
 import asyncio
@@ -48,7 +48,7 @@ from tests.system.ros2.test_gateway_ros import judge
 __all__ = ["judge"]
 pytestmark = pytest.mark.asyncio(loop_scope="module")
 TICK_S = 0.02
-SAID_TICKS = 10  # from one time that all the others are published to the next
+SLOW_TICKS = 10  # period of all messages but states
 STAMP = {"sec": 1_795_580_000, "nanosec": 500_000_007}
 STAMP_NS = STAMP["sec"] * 10**9 + STAMP["nanosec"]
 LENS = (-0.5, 0.5, -0.5, 0.5)
@@ -73,7 +73,7 @@ JOINTS = (
 )
 WAY = TaskStatus(path=((0.0, 0.0), (1.0, 0.0), (1.0, 2.0)), goal=Goal(x=1.0, y=2.0, yaw=math.pi))
 DEPTHS = DepthImage(frame_id="front", height=240, width=320, planes=pack_depth(PIXELS))
-SAID: tuple[tuple[Topic[Any], Message, str], ...] = (
+SLOW_MESSAGES: tuple[tuple[Topic[Any], Message, str], ...] = (
     (BODY, samples.body(WAFFLE), ""),
     (SCAN, samples.scan(NEAR), ""),
     (IMU, READING, ""),
@@ -86,7 +86,7 @@ SAID: tuple[tuple[Topic[Any], Message, str], ...] = (
 )
 
 
-class Played:
+class SimulatedProcesses:
     """A stand-in for a robot's processes, which publishes their messages."""
 
     def __init__(self, bus: Bus) -> None:
@@ -98,27 +98,30 @@ class Played:
         while True:
             self._bus.time.tick = self._tick = self._tick + 1
             state = samples.state(self._tick, pose=(1.0, 0.0, 0.0), v=0.2, w=-0.3, battery=40.0)
-            self._say(STATE, replace(state, joints=JOINTS))
+            self._publish(STATE, replace(state, joints=JOINTS))
             here = PoseInMap(x=5.0, y=5.0, yaw=math.pi / 2, covariance=(0.0,) * 9)
             self._bus.publish(POSE, here, basis=self._tick)
-            for topic, message, name in SAID if self._tick % SAID_TICKS == 1 else ():
-                self._say(topic, message, name)
+            for topic, message, name in SLOW_MESSAGES if self._tick % SLOW_TICKS == 1 else ():
+                self._publish(topic, message, name)
             await asyncio.sleep(TICK_S)
 
-    def _say(self, topic: Topic[Any], message: Message, name: str = "") -> None:
+    def _publish(self, topic: Topic[Any], message: Message, name: str = "") -> None:
         self._bus.publish(topic, message, name=name, stamp_ns=STAMP_NS, basis=self._tick)
 
 
 @pytest_asyncio.fixture(loop_scope="module", scope="module")
 async def gateway(shared_judge: Judge) -> AsyncIterator[None]:
-    """A gateway in the judge's domain, on a robot that is played."""
+    """A gateway in the judge's domain, on a simulated robot."""
     network, clock, ready = LocalNetwork(), Clock(), asyncio.Event()
     config = Ros2Config(transport="dds", domain=shared_judge.domain, localhost=True)
-    played, bus = Bus(network.transport(), clock, "driver"), Bus(network.transport(), clock, "ros2")
+    simulated, bus = (
+        Bus(network.transport(), clock, "driver"),
+        Bus(network.transport(), clock, "ros2"),
+    )
     async with open_transport(config, types()) as ros:
         ends = [
             asyncio.ensure_future(serve(config, bus, ros, types(), ready.set)),
-            asyncio.ensure_future(Played(played).run()),
+            asyncio.ensure_future(SimulatedProcesses(simulated).run()),
         ]
         await ready.wait()
         yield
@@ -126,26 +129,26 @@ async def gateway(shared_judge: Judge) -> AsyncIterator[None]:
             end.cancel()
         await asyncio.gather(*ends, return_exceptions=True)
     await bus.close()
-    await played.close()
+    await simulated.close()
 
 
-Heard = dict[str, Any]
+Messages = dict[str, Any]
 BATTERY = "gigabrain: battery"
 
 
 def is_whole(topic: str, report: dict[str, Any]) -> bool:
-    """Return whether a message has come that knows all that the robot has said."""
+    """Return whether a message has arrived that contains all data of the robot."""
     if not report["count"]:
         return False
     (value,) = report["values"]
     if topic == "/tf":
         return bool(value["transforms"][0]["header"]["frame_id"] == "map")
-    return topic != "/diagnostics" or BATTERY in [one["name"] for one in value["status"]]
+    return topic != "/diagnostics" or BATTERY in [each["name"] for each in value["status"]]
 
 
 @pytest_asyncio.fixture(loop_scope="module", scope="module")
-async def received(gateway: None, shared_judge: Judge) -> AsyncIterator[Heard]:
-    """The newest message of each topic, as rclpy has it."""
+async def received(gateway: None, shared_judge: Judge) -> AsyncIterator[Messages]:
+    """The newest message of each topic, as received by rclpy."""
     listener = shared_judge.start("listen")
     for topic, (kind, qos) in TABLE.items():
         wanted = {name: getattr(qos, name) for name in ("reliable", "transient_local", "depth")}
@@ -174,21 +177,21 @@ def about_z(half: float) -> dict[str, float]:
 
 
 async def test_ros_knows_type_hash_and_qos_of_every_topic(
-    gateway: None, received: Heard, judge: Judge
+    gateway: None, received: Messages, judge: Judge
 ) -> None:
     listener = judge.start("listen", node="looker")
 
     def names_us(answer: dict[str, Any]) -> bool:
-        return [one["node"] for one in answer["publishers"]] == ["gigabrain"]
+        return [each["node"] for each in answer["publishers"]] == ["gigabrain"]
 
     for topic, (kind, qos) in TABLE.items():
         found = await asyncio.to_thread(listener.poll, "endpoints", names_us, topic=topic)
-        (one,) = found["publishers"]
-        assert (one["type"], one["hash"]) == (kind, types().hash(kind))
-        assert (one["reliable"], one["transient_local"]) == (qos.reliable, qos.transient_local)
+        (each,) = found["publishers"]
+        assert (each["type"], each["hash"]) == (kind, types().hash(kind))
+        assert (each["reliable"], each["transient_local"]) == (qos.reliable, qos.transient_local)
 
 
-async def test_scans_have_ranges_angles_and_what_was_not_hit(received: Heard) -> None:
+async def test_scans_have_ranges_angles_and_beams_without_a_return(received: Messages) -> None:
     scan = received["/scan"]
     assert scan["header"] == head("base_scan")
     assert np.array_equal(scan["ranges"], NEAR.astype(float), equal_nan=True)
@@ -197,7 +200,7 @@ async def test_scans_have_ranges_angles_and_what_was_not_hit(received: Heard) ->
     assert (scan["scan_time"], scan["intensities"]) == (pytest.approx(0.1), [])
 
 
-async def test_odometry_frames_and_joints_are_those_of_the_state(received: Heard) -> None:
+async def test_odometry_frames_and_joints_are_those_of_the_state(received: Messages) -> None:
     odom = received["/odom"]
     assert (odom["header"], odom["child_frame_id"]) == (head("odom"), "base_footprint")
     assert odom["pose"]["pose"]["position"] == {"x": 1.0, "y": 0.0, "z": 0.0}
@@ -209,16 +212,16 @@ async def test_odometry_frames_and_joints_are_those_of_the_state(received: Heard
     assert received["/clock"]["clock"] == STAMP
 
 
-async def test_the_frames_lead_from_the_map_to_each_sensor(received: Heard) -> None:
-    moving = {one["child_frame_id"]: one for one in received["/tf"]["transforms"]}
-    assert [one["header"]["frame_id"] for one in moving.values()] == [
+async def test_the_frames_lead_from_the_map_to_each_sensor(received: Messages) -> None:
+    moving = {each["child_frame_id"]: each for each in received["/tf"]["transforms"]}
+    assert [each["header"]["frame_id"] for each in moving.values()] == [
         "map", "odom", "base_link", "base_link",
     ]  # fmt: skip
     odom = moving["odom"]["transform"]
     assert odom["translation"] == {"x": pytest.approx(5.0), "y": pytest.approx(4.0), "z": 0.0}
     assert odom["rotation"] == about_z(math.pi / 4)
-    static = {one["child_frame_id"]: one for one in received["/tf_static"]["transforms"]}
-    parents = {name: one["header"]["frame_id"] for name, one in static.items()}
+    static = {each["child_frame_id"]: each for each in received["/tf_static"]["transforms"]}
+    parents = {name: each["header"]["frame_id"] for name, each in static.items()}
     assert parents == {
         "base_link": "base_footprint", "imu_link": "base_link", "base_scan": "base_link",
         "front_link": "base_link", "front_optical_frame": "front_link",
@@ -228,7 +231,7 @@ async def test_the_frames_lead_from_the_map_to_each_sensor(received: Heard) -> N
     assert tuple(lens[axis] for axis in "xyzw") == LENS
 
 
-async def test_the_imu_the_battery_and_the_description_arrive(received: Heard) -> None:
+async def test_the_imu_the_battery_and_the_description_arrive(received: Messages) -> None:
     imu = received["/imu"]
     assert imu["header"] == head("imu_link")
     assert imu["linear_acceleration"] == {"x": 1.0, "y": 0.0, "z": 9.8}
@@ -241,7 +244,7 @@ async def test_the_imu_the_battery_and_the_description_arrive(received: Heard) -
     assert 'link name="front_optical_frame"' in received["/robot_description"]["data"]
 
 
-async def test_the_map_and_the_plan_arrive(received: Heard) -> None:
+async def test_the_map_and_the_plan_arrive(received: Messages) -> None:
     grid = received["/map"]
     assert (grid["header"], grid["data"]) == (head("map"), [100, -1])
     info = grid["info"]
@@ -249,14 +252,14 @@ async def test_the_map_and_the_plan_arrive(received: Heard) -> None:
     assert info["resolution"] == pytest.approx(0.1)
     plan = received["/plan"]
     assert plan["header"] == head("map")
-    assert [one["header"] for one in plan["poses"]] == [head("map")] * 3
-    places = [one["pose"]["position"] for one in plan["poses"]]
+    assert [each["header"] for each in plan["poses"]] == [head("map")] * 3
+    places = [each["pose"]["position"] for each in plan["poses"]]
     assert [(at["x"], at["y"]) for at in places] == [(0.0, 0.0), (1.0, 0.0), (1.0, 2.0)]
     assert plan["poses"][1]["pose"]["orientation"] == about_z(math.pi / 4)
     assert plan["poses"][2]["pose"]["orientation"] == about_z(math.pi / 2)
 
 
-async def test_pictures_arrive_with_the_intrinsics_of_their_camera(received: Heard) -> None:
+async def test_pictures_arrive_with_the_intrinsics_of_their_camera(received: Messages) -> None:
     for at, name, data, size in (
         ("/camera", "front", PICTURE.data, (320, 240)),
         ("/camera/rear", "rear", b"\xff\xd8rear", (16, 16)),
@@ -272,7 +275,7 @@ async def test_pictures_arrive_with_the_intrinsics_of_their_camera(received: Hea
     assert about["r"] == [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0]
 
 
-async def test_depth_arrives_in_millimetres_with_its_camera(received: Heard) -> None:
+async def test_depth_arrives_in_millimetres_with_its_camera(received: Messages) -> None:
     depth, about = received["/camera/depth/image_raw"], received["/camera/depth/camera_info"]
     assert depth["header"] == about["header"] == head("front_optical_frame")
     assert (depth["encoding"], depth["is_bigendian"], depth["step"]) == ("16UC1", 0, 640)
@@ -281,12 +284,12 @@ async def test_depth_arrives_in_millimetres_with_its_camera(received: Heard) -> 
     assert about["k"][0] == 270.0
 
 
-async def test_diagnostics_name_the_parts_of_the_robot(received: Heard) -> None:
-    found = {one["name"]: one for one in received["/diagnostics"]["status"]}
+async def test_diagnostics_name_the_parts_of_the_robot(received: Messages) -> None:
+    found = {each["name"]: each for each in received["/diagnostics"]["status"]}
     assert {"gigabrain: gate", "gigabrain: safety"} <= found.keys()
     assert found[BATTERY]["message"] == "40 %, 12.0 V"
     assert found["gigabrain: cmd_vel"]["message"] == "no commands"
-    assert {one["hardware_id"] for one in found.values()} == {"waffle"}
+    assert {each["hardware_id"] for each in found.values()} == {"waffle"}
 
 
 async def called(caller: Program, name: str, **request: Any) -> Any:
@@ -295,7 +298,7 @@ async def called(caller: Program, name: str, **request: Any) -> Any:
     where = {"service": f"/gigabrain/{name}", "type": f"rcl_interfaces/srv/{kind}"}
     await caller.available(**where)
     await caller.query("call", **where, name=name, **request)
-    return (await caller.hear("response", name=name))["value"]
+    return (await caller.wait_async("response", name=name))["value"]
 
 
 async def test_ros_reads_the_parameters_and_cannot_set_them(gateway: None, judge: Judge) -> None:
@@ -304,11 +307,11 @@ async def test_ros_reads_the_parameters_and_cannot_set_them(gateway: None, judge
     assert {"use_sim_time", "transport", "cmd_vel_timeout", "take"} <= set(names)
     asked = ["use_sim_time", "domain", "cmd_vel_timeout", "transport", "leave_out", "nothing"]
     values = (await called(caller, "get_parameters", names=asked))["values"]
-    assert [one["type"] for one in values] == [1, 2, 3, 4, 9, 0]
+    assert [each["type"] for each in values] == [1, 2, 3, 4, 9, 0]
     assert (values[0]["bool_value"], values[1]["integer_value"]) == (True, judge.domain)
     assert (values[2]["double_value"], values[3]["string_value"]) == (0.2, "dds")
     described = await called(caller, "describe_parameters", names=["take"])
-    assert [one["read_only"] for one in described["descriptors"]] == [True]
+    assert [each["read_only"] for each in described["descriptors"]] == [True]
     wanted = [{"name": "take", "value": {"type": 1, "bool_value": True}}]
     (refused,) = (await called(caller, "set_parameters", parameters=wanted))["results"]
     assert (refused["successful"], "read-only" in refused["reason"]) == (False, True)

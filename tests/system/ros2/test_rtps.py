@@ -1,4 +1,4 @@
-"""Services of ours, called by rclpy over Fast DDS, and services of rclpy, called by us."""
+"""Our services, called by rclpy over Fast DDS, and services of rclpy, called by us."""
 
 import asyncio
 import contextlib
@@ -28,7 +28,7 @@ ESTOP = {"service": "/estop", "type": SET_BOOL}
 
 
 class Bus:
-    """A participant of ours, with values in place of payloads."""
+    """Our participant, with messages instead of payloads."""
 
     def __init__(self, bus: RequestReply, types: Types) -> None:
         self.bus, self.types = bus, types
@@ -69,20 +69,20 @@ async def bus(judge: Judge, types: Types) -> AsyncIterator[Bus]:
 
 
 async def calls(program: Program, count: int, service: str, type: str, **request: Any):
-    """Call one after the other; return the responses."""
+    """Call a service `count` times, one after the other; return the responses."""
     responses = []
     for number in range(count):
         name = f"{service}-{len(program.seen('response'))}-{number}"
         await asyncio.to_thread(
             program.send, "call", service=service, type=type, name=name, **request
         )
-        responses.append(await program.hear("response", name=name))
+        responses.append(await program.wait_async("response", name=name))
     return responses
 
 
 @contextmanager
 def server(domain: int, service: str, name: str) -> Iterator[subprocess.Popen[bytes]]:
-    """Run a server of ours in a process of its own."""
+    """Run our server in a separate process."""
     script = Path(__file__).with_name("rtps_server.py")
     command = [sys.executable, str(script), str(domain), service, name]
     process = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE)
@@ -96,7 +96,7 @@ def server(domain: int, service: str, name: str) -> Iterator[subprocess.Popen[by
         process.stdout.close()
 
 
-async def test_rclpy_gets_the_reply_of_our_server(judge: Judge, bus: Bus) -> None:
+async def test_rclpy_receives_the_reply_of_our_server(judge: Judge, bus: Bus) -> None:
     bus.serve("/estop", SET_BOOL, success=True, message="stopped")
     call = judge.start("call")
     await call.available(**ESTOP)
@@ -107,7 +107,7 @@ async def test_rclpy_gets_the_reply_of_our_server(judge: Judge, bus: Bus) -> Non
     assert [request.data for request in bus.requests] == [True]
 
 
-async def test_a_client_that_was_there_first_finds_our_server(judge: Judge, bus: Bus) -> None:
+async def test_a_client_that_started_first_finds_our_server(judge: Judge, bus: Bus) -> None:
     call = judge.start("call")
     assert not (await call.query("available", **ESTOP))["available"]
     bus.serve("/estop", SET_BOOL, success=True)
@@ -116,11 +116,11 @@ async def test_a_client_that_was_there_first_finds_our_server(judge: Judge, bus:
     assert (await calls(call, 1, **ESTOP, data=True))[0]["value"]["success"]
 
 
-async def test_behind_many_other_participants_our_server_is_found(
+async def test_our_server_is_found_beside_many_other_participants(
     judge: Judge, types: Types
 ) -> None:
     with contextlib.ExitStack() as others:
-        for index in range(40):  # more than ROS looks for without multicast
+        for index in range(40):  # more than ROS announces to without multicast
             for port in participant_ports(judge.domain, index):
                 taken = others.enter_context(socket.socket(type=socket.SOCK_DGRAM))
                 taken.bind(("", port))
@@ -146,15 +146,15 @@ async def test_a_thousand_requests_get_a_thousand_replies(judge: Judge, bus: Bus
     stopped = await calls(call, 500, **ESTOP, data=True)
     released = await calls(call, 500, "/release", TRIGGER)
 
-    assert all(one["value"] == {"success": True, "message": "stopped"} for one in stopped)
+    assert all(each["value"] == {"success": True, "message": "stopped"} for each in stopped)
     refused = {"success": False, "message": "it is still moving"}
-    assert all(one["value"] == refused for one in released)
-    took_ms = sorted(1e3 * one["took_s"] for one in (*stopped, *released))
+    assert all(each["value"] == refused for each in released)
+    took_ms = sorted(1e3 * each["took_s"] for each in (*stopped, *released))
     print(f"median {statistics.median(took_ms):.2f} ms, p99 {took_ms[989]:.2f} ms")
 
 
 @pytest.mark.slow
-async def test_many_requests_at_once_are_all_answered(judge: Judge, bus: Bus) -> None:
+async def test_many_simultaneous_requests_are_all_answered(judge: Judge, bus: Bus) -> None:
     bus.serve("/estop", SET_BOOL, wait_s=0.05, success=True)
     programs = [await asyncio.to_thread(judge.start, "call", f"call{n}") for n in range(3)]
     for program in programs:
@@ -164,7 +164,7 @@ async def test_many_requests_at_once_are_all_answered(judge: Judge, bus: Bus) ->
 
     for program in programs:
         for number in range(8):
-            assert (await program.hear("response", name=str(number)))["value"]["success"]
+            assert (await program.wait_async("response", name=str(number)))["value"]["success"]
 
 
 async def test_replies_and_requests_longer_than_a_datagram_arrive(judge: Judge, bus: Bus) -> None:
@@ -211,7 +211,7 @@ async def test_two_servers_in_two_processes_answer_their_services(judge: Judge) 
 
 
 @pytest.mark.slow  # ROS gives its participants a lease of 20 s
-async def test_a_client_killed_while_it_waits_leaves_nothing_behind(judge: Judge, bus: Bus) -> None:
+async def test_a_client_killed_while_it_waits_is_forgotten(judge: Judge, bus: Bus) -> None:
     served = bus.serve("/estop", SET_BOOL, wait_s=1.0, success=True)
     call = judge.start("call")
     await call.available(**ESTOP)
@@ -229,7 +229,7 @@ async def test_a_client_killed_while_it_waits_leaves_nothing_behind(judge: Judge
     assert (await calls(later, 1, **ESTOP, data=True))[0]["value"]["success"]
 
 
-async def test_we_get_the_reply_of_an_rclpy_server(judge: Judge, bus: Bus) -> None:
+async def test_our_client_receives_the_reply_of_an_rclpy_server(judge: Judge, bus: Bus) -> None:
     serve = judge.start("serve")
     serve.ask("service", **ESTOP, success=True, message="stopped")
 
@@ -237,12 +237,12 @@ async def test_we_get_the_reply_of_an_rclpy_server(judge: Judge, bus: Bus) -> No
         reply = await bus.call("/estop", SET_BOOL, data=bool(number % 2))
         assert (reply.success, reply.message) == (True, "stopped")
 
-    await serve.hear("request", nth=19)  # said beside the reply, and read a little later
-    values = [one["value"]["data"] for one in serve.seen("request")]
+    await serve.wait_async("request", nth=19)  # the event may be read a little after the reply
+    values = [each["value"]["data"] for each in serve.seen("request")]
     assert values == [False, True] * 10
 
 
-async def test_we_wait_for_a_server_that_comes_later(judge: Judge, bus: Bus) -> None:
+async def test_our_client_waits_for_a_server_that_starts_later(judge: Judge, bus: Bus) -> None:
     called = asyncio.create_task(bus.call("/estop", SET_BOOL, data=True))
     serve = await asyncio.to_thread(judge.start, "serve")
     await serve.query("service", **ESTOP, success=True, message="late")
@@ -276,10 +276,10 @@ async def test_ros_lists_our_services_with_their_hashes(judge: Judge, bus: Bus) 
     assert found["services"]["/estop"] == [SET_BOOL]
 
 
-async def test_ours_meet_by_multicast_too(types: Types) -> None:
+async def test_our_participants_find_each_other_by_multicast(types: Types) -> None:
     with free_domain() as domain:
-        one, two = await RequestReply.open(domain), await RequestReply.open(domain)
-        Bus(one, types).serve("/estop", SET_BOOL, success=True)
+        each, two = await RequestReply.open(domain), await RequestReply.open(domain)
+        Bus(each, types).serve("/estop", SET_BOOL, success=True)
         assert (await Bus(two, types).call("/estop", SET_BOOL, data=True)).success
-        await one.close()
+        await each.close()
         await two.close()

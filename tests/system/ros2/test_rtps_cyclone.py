@@ -74,7 +74,7 @@ async def both() -> AsyncIterator[tuple[RequestReply, Cyclone]]:
 
 
 async def taken(reader: DataReader) -> Any:
-    """Return the next valid sample."""
+    """Wait for the next valid sample, and return it."""
     found: list[Any] = []
 
     def take() -> bool:
@@ -85,7 +85,7 @@ async def taken(reader: DataReader) -> Any:
     return found[0]
 
 
-async def test_a_client_of_cyclone_gets_our_reply_with_its_own_header(both) -> None:
+async def test_a_cyclone_client_receives_our_reply_with_its_own_header(both) -> None:
     bus, cyclone = both
     got: list[bytes] = []
 
@@ -106,7 +106,7 @@ async def test_a_client_of_cyclone_gets_our_reply_with_its_own_header(both) -> N
     assert [request[:5] for request in got] == [TRUE[:5]] * 2
 
 
-async def test_we_get_the_reply_of_a_server_of_cyclone_and_not_that_of_others(both) -> None:
+async def test_our_client_receives_its_reply_of_a_cyclone_server_and_not_others(both) -> None:
     bus, cyclone = both
     reader, writer = cyclone.server()
     call = asyncio.create_task(bus.call("/estop", SET_BOOL, TRUE, 30.0))

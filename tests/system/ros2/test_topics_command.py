@@ -1,4 +1,4 @@
-"""`gigabrain ros2 topics` and `pass`, and `doctor`, beside real ROS 2 over DDS."""
+"""The commands `ros2 topics`, `ros2 pass` and `doctor`, with real ROS 2 over DDS."""
 
 import asyncio
 import json
@@ -63,7 +63,9 @@ async def test_topics_of_rclpy_are_listed_with_types_qos_and_nodes(
 
 
 @pytest.mark.slow
-async def test_where_no_node_is_found_it_says_what_to_check(home: Home, judge: Judge) -> None:
+async def test_without_other_nodes_the_command_names_the_usual_reasons(
+    home: Home, judge: Judge
+) -> None:
     command = await home.run("ros2", "topics", *join(judge))
     assert await command.ended() == 1
     assert command.err.startswith(f"gigabrain: no node of ROS in domain {judge.domain}: check on")
@@ -71,7 +73,7 @@ async def test_where_no_node_is_found_it_says_what_to_check(home: Home, judge: J
 
 
 @pytest.mark.slow
-async def test_a_robots_keys_are_listed_and_doctor_finds_what_does_not_match(
+async def test_keys_of_a_robot_are_listed_and_doctor_finds_mismatches(
     home: Home, judge: Judge, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     async with running(home, judge) as robot:
@@ -93,14 +95,14 @@ async def test_a_robots_keys_are_listed_and_doctor_finds_what_does_not_match(
 
         monkeypatch.setenv("ROS_DOMAIN_ID", str(judge.domain + 1))
         mismatch = "/scan: nothing passes from /gigabrain to /rviz"
-        while True:  # the gateway looks at the graph every few seconds
+        while True:  # the gateway checks the graph every few seconds
             command = await robot.home.run("doctor", "--json")
             found = [json.loads(line) for line in command.out.splitlines()]
-            if any(one["text"].startswith(mismatch) for one in found):
+            if any(each["text"].startswith(mismatch) for each in found):
                 break
-        of_ros = {one["text"]: one for one in found if one["about"] == "ros2"}
+        of_ros = {each["text"]: each for each in found if each["about"] == "ros2"}
         wrong = f"ROS_DOMAIN_ID is {judge.domain + 1} in this shell, and {judge.domain} in the"
-        assert {one["grade"] for text, one in of_ros.items() if text.startswith(wrong)} == {"bad"}
+        assert {each["grade"] for text, each in of_ros.items() if text.startswith(wrong)} == {"bad"}
         joined = f"node /gigabrain on dds, domain {judge.domain}, other nodes: 3"
         assert of_ros[joined]["grade"] == "ok"
 
@@ -113,7 +115,7 @@ async def bus() -> AsyncIterator[tuple[Bus, str]]:
             yield made, router
 
 
-async def test_our_messages_reach_rclpy_as_json_and_nobody_encodes_them_before(
+async def test_our_messages_reach_rclpy_from_json_and_are_not_encoded_without_readers(
     home: Home, judge: Judge, bus: tuple[Bus, str]
 ) -> None:
     ours, router = bus
@@ -132,7 +134,7 @@ async def test_our_messages_reach_rclpy_as_json_and_nobody_encodes_them_before(
     assert world.sectors == example(WorldModel).sectors
 
 
-async def test_messages_of_rclpy_reach_a_key_as_json_latched_ones_too(
+async def test_messages_of_rclpy_reach_a_key_as_json_including_latched_ones(
     home: Home, judge: Judge, bus: tuple[Bus, str]
 ) -> None:
     ours, router = bus
@@ -181,7 +183,7 @@ async def test_over_rmw_zenoh_both_commands_use_the_robots_router(
         (("robot/world", "/world", "std_msgs/Strng"), "did you mean 'std_msgs/msg/String'"),
     ],
 )
-async def test_what_cannot_pass_is_refused_in_one_line(
+async def test_an_impossible_pass_is_refused_in_one_line(
     home: Home, bus: tuple[Bus, str], words: tuple[str, ...], error: str
 ) -> None:
     command = await home.run("ros2", "pass", *words, "--transport", "dds", "--connect", bus[1])

@@ -1,4 +1,4 @@
-"""Topics of ours over DDS, with real ROS 2 on the other side."""
+"""Our topics over DDS, with real ROS 2 on the other side."""
 
 import contextlib
 import json
@@ -33,7 +33,7 @@ def types() -> Types:
 
 
 class Node:
-    """Opens transports of ours in the judge's domain."""
+    """Opens our transports in the judge's domain."""
 
     def __init__(self, judge: Judge, types: Types) -> None:
         self.judge, self.types = judge, types
@@ -63,7 +63,7 @@ async def node(judge: Judge, types: Types) -> AsyncIterator[Node]:
         yield made
 
 
-async def test_ros_reads_our_values_and_sees_type_hash_and_qos(judge: Judge, node: Node) -> None:
+async def test_ros_receives_our_values_and_sees_type_hash_and_qos(judge: Judge, node: Node) -> None:
     ours = await node.open("robot", "/red")
     publisher = ours.publisher("scan", SCAN, SENSOR_DATA)
     listen = judge.start("listen", node="ears")
@@ -85,7 +85,7 @@ async def test_ros_reads_our_values_and_sees_type_hash_and_qos(judge: Judge, nod
     assert (seen["reliable"], seen["transient_local"]) == (False, False)
 
 
-async def test_we_read_what_ros_publishes(judge: Judge, node: Node) -> None:
+async def test_our_node_receives_messages_of_ros(judge: Judge, node: Node) -> None:
     ours = await node.open()
     got: list[Received] = []
     ours.subscribe("/cmd_vel", TWIST, DEFAULT, got.append)
@@ -94,23 +94,23 @@ async def test_we_read_what_ros_publishes(judge: Judge, node: Node) -> None:
     await until(lambda: len(got) >= 20, "commands")
     twist = node.types.decode(TWIST, got[-1].payload)
     assert (twist.linear.x, twist.angular.z) == (0.25, -0.5)
-    times = [one.source_ns for one in got if one.source_ns]
+    times = [each.source_ns for each in got if each.source_ns]
     assert times == sorted(times)
     assert len(set(times)) == len(got)
 
     def theirs() -> list[GraphEndpoint]:
-        return [one for one in ours.endpoints() if one.topic == "/cmd_vel" and not one.ours]
+        return [each for each in ours.endpoints() if each.topic == "/cmd_vel" and not each.ours]
 
-    await until(lambda: [one.node for one in theirs()] == ["/hands"], "the publisher's node")
+    await until(lambda: [each.node for each in theirs()] == ["/hands"], "the publisher's node")
     (endpoint,) = theirs()
     assert (endpoint.kind, endpoint.type) == ("publisher", TWIST)
     assert endpoint.hash == node.types.hash(TWIST)
     assert endpoint.qos.reliable
     seen = await drive.endpoints("/cmd_vel")
-    assert {one["gid"] for one in seen["publishers"]} == {one.gid.hex() for one in got}
+    assert {each["gid"] for each in seen["publishers"]} == {each.gid.hex() for each in got}
 
 
-async def test_a_map_reaches_ros_that_joins_late_whole(judge: Judge, node: Node) -> None:
+async def test_a_late_ros_node_receives_a_whole_map(judge: Judge, node: Node) -> None:
     ours = await node.open()
     cells = np.random.default_rng(1).integers(-1, 101, 200_000).astype(np.int8)
     message = node.types.make(MAP, info={"width": 500, "height": 400}, data=cells)
@@ -123,7 +123,7 @@ async def test_a_map_reaches_ros_that_joins_late_whole(judge: Judge, node: Node)
     assert np.array_equal(grid["data"], cells)
 
 
-async def test_we_get_what_ros_latched_before_we_came(judge: Judge, node: Node) -> None:
+async def test_our_late_node_receives_latched_messages_of_ros(judge: Judge, node: Node) -> None:
     drive = judge.start("drive")
     latched = {"reliable": True, "transient_local": True, "depth": 1}
     drive.ask("publish", topic="/told", type=STRING, value={"data": "grüß"}, **latched)
@@ -133,7 +133,7 @@ async def test_we_get_what_ros_latched_before_we_came(judge: Judge, node: Node) 
     assert node.types.decode(STRING, got[0].payload).data == "grüß"
 
 
-async def test_ros_that_is_killed_and_comes_again_is_found_again(judge: Judge, node: Node) -> None:
+async def test_a_killed_and_restarted_ros_node_is_found_again(judge: Judge, node: Node) -> None:
     ours = await node.open()
     got: list[Received] = []
     ours.subscribe("/cmd_vel", TWIST, DEFAULT, got.append)
@@ -144,7 +144,7 @@ async def test_ros_that_is_killed_and_comes_again_is_found_again(judge: Judge, n
         drive.kill()
 
 
-async def test_our_node_that_comes_again_is_found_again(judge: Judge, node: Node) -> None:
+async def test_our_restarted_node_is_found_again(judge: Judge, node: Node) -> None:
     listen = judge.start("listen")
     listen.ask("subscribe", topic="/scan", type=SCAN, qos={"reliable": False})
     scan = node.payload(SCAN, **SCAN_VALUES)
@@ -153,7 +153,7 @@ async def test_our_node_that_comes_again_is_found_again(judge: Judge, node: Node
         async with node.opened() as ours:
             publisher = ours.publisher("/scan", SCAN, SENSOR_DATA)
             await until(lambda to=publisher: to.readers == 1, "ROS's reader")
-            await repeat(  # as ROS may find it a moment later
+            await repeat(  # ROS may discover it a moment later
                 lambda to=publisher: to.publish(scan),
                 lambda n=before: listen.ask("report", topic="/scan")["count"] > n,
             )

@@ -22,20 +22,20 @@ async def nodes(request: pytest.FixtureRequest) -> AsyncIterator[Nodes]:
 
 async def test_a_message_arrives_with_its_time_and_sender(nodes: Nodes) -> None:
     talker, listener = await nodes.node("talker"), await nodes.node("listener")
-    got: list[Received] = []
-    listener.subscribe("/chatter", STRING, Qos(), got.append)
+    delivered: list[Received] = []
+    listener.subscribe("/chatter", STRING, Qos(), delivered.append)
     publisher = talker.publisher("/chatter", STRING)
     await until(lambda: publisher.readers == 1, "the reader")
-    await repeat(lambda: publisher.publish(nodes.string("hi")), lambda: len(got) > 1)
-    assert {nodes.text(each.payload) for each in got} == {"hi"}
-    times = [each.source_ns or 0 for each in got]
+    await repeat(lambda: publisher.publish(nodes.string("hi")), lambda: len(delivered) > 1)
+    assert {nodes.text(each.payload) for each in delivered} == {"hi"}
+    times = [each.source_ns or 0 for each in delivered]
     assert times == sorted(times)
     assert times[0] > 0
-    assert len({each.gid for each in got}) == 1
-    assert len(got[0].gid) == 16
+    assert len({each.gid for each in delivered}) == 1
+    assert len(delivered[0].gid) == 16
 
 
-async def test_a_reader_is_told_as_it_comes_and_goes(nodes: Nodes) -> None:
+async def test_a_publisher_counts_its_readers(nodes: Nodes) -> None:
     told: list[int] = []
     talker = await nodes.node("talker")
     publisher = talker.publisher("/chatter", STRING, on_readers=told.append)
@@ -51,14 +51,14 @@ async def test_a_reader_is_told_as_it_comes_and_goes(nodes: Nodes) -> None:
     assert told[-1] == 0
 
 
-async def test_a_node_does_not_hear_itself(nodes: Nodes) -> None:
+async def test_a_node_does_not_receive_its_own_messages(nodes: Nodes) -> None:
     node, other = await nodes.node("talker"), await nodes.node("listener")
     own: list[Received] = []
-    got: list[Received] = []
+    delivered: list[Received] = []
     node.subscribe("/chatter", STRING, Qos(), own.append)
     publisher = node.publisher("/chatter", STRING)
-    other.subscribe("/chatter", STRING, Qos(), got.append)
-    await repeat(lambda: publisher.publish(nodes.string("hi")), lambda: got)
+    other.subscribe("/chatter", STRING, Qos(), delivered.append)
+    await repeat(lambda: publisher.publish(nodes.string("hi")), lambda: delivered)
     assert own == []
     assert publisher.readers == 1
 
@@ -67,26 +67,26 @@ async def test_a_node_does_not_hear_itself(nodes: Nodes) -> None:
 async def test_a_latched_message_reaches_late_joiners_in_either_order(
     nodes: Nodes, first: str
 ) -> None:
-    got: list[Received] = []
+    delivered: list[Received] = []
     if first == "subscriber":
-        (await nodes.node("listener")).subscribe("/map", STRING, LATCHED, got.append)
+        (await nodes.node("listener")).subscribe("/map", STRING, LATCHED, delivered.append)
     publisher = (await nodes.node("talker")).publisher("/map", STRING, LATCHED)
     publisher.publish(nodes.string("old"))
     publisher.publish(nodes.string("map"))
     if first == "publisher":
-        (await nodes.node("listener")).subscribe("/map", STRING, LATCHED, got.append)
-    await until(lambda: got and nodes.text(got[-1].payload) == "map", "the map")
+        (await nodes.node("listener")).subscribe("/map", STRING, LATCHED, delivered.append)
+    await until(lambda: delivered and nodes.text(delivered[-1].payload) == "map", "the map")
 
 
 async def test_a_message_of_a_megabyte_arrives_whole(nodes: Nodes) -> None:
     image = "sensor_msgs/msg/Image"
     types = nodes.types
     payload = types.encode(image, types.make(image, data=bytes(range(256)) * 4096))
-    got: list[Received] = []
-    (await nodes.node("listener")).subscribe("/image", image, SENSOR_DATA, got.append)
+    delivered: list[Received] = []
+    (await nodes.node("listener")).subscribe("/image", image, SENSOR_DATA, delivered.append)
     publisher = (await nodes.node("talker")).publisher("/image", image, SENSOR_DATA)
-    await repeat(lambda: publisher.publish(payload), lambda: got)
-    assert got[0].payload == payload
+    await repeat(lambda: publisher.publish(payload), lambda: delivered)
+    assert delivered[0].payload == payload
 
 
 async def test_the_graph_names_nodes_topics_types_and_qos(nodes: Nodes) -> None:
@@ -109,7 +109,7 @@ async def test_the_graph_names_nodes_topics_types_and_qos(nodes: Nodes) -> None:
     }
 
 
-async def test_a_node_that_leaves_is_forgotten(nodes: Nodes) -> None:
+async def test_a_closed_node_is_forgotten(nodes: Nodes) -> None:
     rviz = await nodes.node("rviz")
     async with nodes.opened("talker") as talker:
         talker.publisher("/chatter", STRING)
@@ -145,7 +145,7 @@ async def test_a_service_answers_and_is_in_the_graph(nodes: Nodes) -> None:
     )
 
 
-async def test_an_unknown_type_and_an_impossible_name_are_refused(nodes: Nodes) -> None:
+async def test_an_unknown_type_and_an_invalid_name_are_rejected(nodes: Nodes) -> None:
     node = await nodes.node()
     with pytest.raises(ConfigError, match="Strin"):
         node.publisher("/chatter", "std_msgs/msg/Strin")
@@ -153,21 +153,21 @@ async def test_an_unknown_type_and_an_impossible_name_are_refused(nodes: Nodes) 
         node.subscribe("a b", STRING, Qos(), lambda _: None)
 
 
-async def test_nothing_is_called_after_the_end(nodes: Nodes) -> None:
-    got: list[Received] = []
+async def test_no_callback_is_called_after_closing(nodes: Nodes) -> None:
+    delivered: list[Received] = []
     talker = await nodes.node("talker")
     async with nodes.opened("listener") as listener:
-        listener.subscribe("/chatter", STRING, Qos(), got.append)
+        listener.subscribe("/chatter", STRING, Qos(), delivered.append)
         publisher = talker.publisher("/chatter", STRING)
-        await repeat(lambda: publisher.publish(nodes.string("hi")), lambda: got)
-    received = len(got)
+        await repeat(lambda: publisher.publish(nodes.string("hi")), lambda: delivered)
+    received = len(delivered)
     for _ in range(10):
         publisher.publish(nodes.string("hi"))
         await asyncio.sleep(0.01)
-    assert len(got) == received
+    assert len(delivered) == received
 
 
-async def test_what_is_closed_after_the_end_was_closed_by_it(nodes: Nodes) -> None:
+async def test_publishers_may_be_closed_after_their_node(nodes: Nodes) -> None:
     async with nodes.opened("talker") as talker:
         publisher = talker.publisher("/chatter", STRING)
         close = talker.subscribe("/cmd_vel", STRING, Qos(), lambda _: None)

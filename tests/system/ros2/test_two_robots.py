@@ -15,7 +15,7 @@ from tests.ros2.judge import Judge, Program
 from tests.system.ros2.test_gateway_ros import READ, Robot, released, running
 
 SPEEDS = {"red": (0.15, -0.5), "blue": (0.0, 0.6)}  # in a circle, and on the spot
-OF_ROS = {"/rosout", "/parameter_events"}
+ROS_TOPICS = {"/rosout", "/parameter_events"}
 
 
 class Pair(NamedTuple):
@@ -37,7 +37,7 @@ async def pair(judge: Judge, tmp_path: Path) -> AsyncIterator[Pair]:
 
 
 def moves(name: str, robot: Robot) -> bool:
-    """Return whether a robot moves as it is told, and not as the other one."""
+    """Return whether a robot moves as commanded, and not as the other one."""
     forward, turning = SPEEDS[name]
     now = robot.now.velocity
     return (
@@ -58,16 +58,16 @@ def drives(report: dict[str, Any], speeds: tuple[float, float]) -> bool:
 
 
 async def driven(driver: Program, listener: Program | None = None, **robots: Robot) -> None:
-    """Let one program drive robots until they move, and odometry that is listened to says so.
+    """Let one program drive robots until they move, and their odometry at `listener` as well.
 
-    On a busy machine a gate may stop at any moment, and then the program has to pause.
+    The gate of a busy machine may stop a robot at any time, and then the program has to pause.
     """
     while True:
         for name in robots:
             linear, angular = SPEEDS[name]
             await driver.query("drive", topic=f"/{name}/cmd_vel", linear=linear, angular=angular)
         with contextlib.suppress(TimeoutError):
-            await until(lambda: all(moves(*one) for one in robots.items()), "they move", 15.0)
+            await until(lambda: all(moves(*each) for each in robots.items()), "they move", 15.0)
             for name in robots if listener else ():
                 fits = functools.partial(drives, speeds=SPEEDS[name])
                 await asyncio.to_thread(
@@ -80,12 +80,14 @@ async def driven(driver: Program, listener: Program | None = None, **robots: Rob
 
 
 def namespaces(graph: dict[str, Any]) -> set[str]:
-    """Return the first parts of the names of all topics, but for those of ROS itself."""
-    return {topic.split("/")[1] for topic in graph["topics"].keys() - OF_ROS}
+    """Return the first parts of the names of all topics, except those of ROS itself."""
+    return {topic.split("/")[1] for topic in graph["topics"].keys() - ROS_TOPICS}
 
 
 @pytest.mark.slow
-async def test_two_robots_are_driven_at_once_and_do_not_mix(pair: Pair, judge: Judge) -> None:
+async def test_two_robots_are_driven_independently_at_the_same_time(
+    pair: Pair, judge: Judge
+) -> None:
     await asyncio.gather(released(pair.red), released(pair.blue))
     driver, listener = judge.start("drive", node="hands"), judge.start("listen")
     for name in SPEEDS:
@@ -96,20 +98,23 @@ async def test_two_robots_are_driven_at_once_and_do_not_mix(pair: Pair, judge: J
 
     async def value(topic: str) -> Any:
         report = await asyncio.to_thread(
-            listener.poll, "report", lambda one: one["count"] > 3 or "static" in topic, topic=topic
+            listener.poll,
+            "report",
+            lambda each: each["count"] > 3 or "static" in topic,
+            topic=topic,
         )
         return report["values"][-1]
 
     for name in SPEEDS:
         assert (await value(f"/{name}/scan"))["header"]["frame_id"] == "base_scan"
         frames = {
-            (one["header"]["frame_id"], one["child_frame_id"])
+            (each["header"]["frame_id"], each["child_frame_id"])
             for topic in ("tf", "tf_static")
-            for one in (await value(f"/{name}/{topic}"))["transforms"]
+            for each in (await value(f"/{name}/{topic}"))["transforms"]
         }
         assert {("odom", "base_footprint"), ("base_footprint", "base_link")} <= frames
         ends = await listener.endpoints(f"/{name}/tf")
-        assert {one["namespace"] for one in ends["publishers"]} == {f"/{name}"}
+        assert {each["namespace"] for each in ends["publishers"]} == {f"/{name}"}
     nodes = {"/red/gigabrain", "/blue/gigabrain"}
 
     graph = await asyncio.to_thread(
@@ -127,8 +132,8 @@ async def test_two_robots_are_driven_at_once_and_do_not_mix(pair: Pair, judge: J
     stop = {"service": "/red/estop", "type": "std_srvs/srv/SetBool"}
     await caller.available(**stop)
     await caller.query("call", **stop, data=True)
-    assert (await caller.hear("response"))["value"]["success"]
+    assert (await caller.wait_async("response"))["value"]["success"]
     await pair.red.becomes("latched")
     await driven(driver, blue=pair.blue)
-    assert {one.sent.linear_x for one in pair.red.states[since:]} == {0.0}
+    assert {each.sent.linear_x for each in pair.red.states[since:]} == {0.0}
     assert pair.blue.now.gate.estop_generation == 0

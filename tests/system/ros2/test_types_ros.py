@@ -1,4 +1,4 @@
-"""Our types against real ROS 2: hashes, and values in both directions."""
+"""Our types compared with real ROS 2: hashes, and values in both directions."""
 
 import random
 from typing import Any
@@ -10,7 +10,7 @@ from gigabrain_zenoh.ros2.types import Types
 from tests.ros2.judge import Judge, Program
 from tests.unit.ros2.random_messages import random_fields
 
-INTERNAL = ("_Event",)  # of service introspection, which rclpy does not import by name
+INTERNAL = ("_Event",)  # types of service introspection, which rclpy does not import by name
 
 
 @pytest.fixture(scope="module")
@@ -30,7 +30,7 @@ def test_hashes_of_all_types_are_those_of_ros(codec: Program, types: Types) -> N
     assert {name: types.hash(name) for name in theirs} == theirs
 
 
-def test_values_of_all_types_go_both_ways(codec: Program, types: Types) -> None:
+def test_values_of_all_types_are_the_same_in_both_directions(codec: Program, types: Types) -> None:
     source = random.Random(7)
     theirs = codec.ask("hashes")["hashes"].keys() & set(types.messages())
     names = sorted(name for name in theirs if not name.endswith(INTERNAL))
@@ -43,15 +43,19 @@ def test_values_of_all_types_go_both_ways(codec: Program, types: Types) -> None:
         read = codec.ask("deserialize", type=name, payload=payload)["value"]
         written = bytes.fromhex(codec.ask("serialize", type=name, value=fields)["payload"])
         ours = types.to_dict(types.decode(name, written))
-        if _plain(read) != _plain(fields) or ours != types.to_dict(message):
+        if _without_additions(read) != _without_additions(fields) or ours != types.to_dict(message):
             wrong.append(name)
     assert wrong == []
 
 
-def _plain(value: Any) -> Any:
-    """Return the value without what rclpy adds: brackets around bytes, and a dummy field."""
+def _without_additions(value: Any) -> Any:
+    """Return the value without the additions of rclpy: lists around bytes, and a dummy field."""
     if isinstance(value, dict):
-        return {name: _plain(each) for name, each in value.items() if name != DUMMY}
+        return {name: _without_additions(each) for name, each in value.items() if name != DUMMY}
     if isinstance(value, list):
-        return _plain(value[0]) if len(value) == 1 else [_plain(each) for each in value]
+        return (
+            _without_additions(value[0])
+            if len(value) == 1
+            else [_without_additions(each) for each in value]
+        )
     return value

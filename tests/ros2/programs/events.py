@@ -1,4 +1,4 @@
-"""Prints events, as all programs of the judge do."""
+"""Prints events as lines of JSON, for all programs of the judge."""
 
 import json
 import threading
@@ -8,8 +8,8 @@ from typing import Any
 _printing = threading.Lock()
 
 
-def say(event: str, **fields: Any) -> None:
-    """Print an event, with the monotonic time at which it is printed unless `at_ns` is given."""
+def emit(event: str, **fields: Any) -> None:
+    """Print an event with its monotonic time `at_ns`; the default is now."""
     line = json.dumps({"event": event, "at_ns": time.monotonic_ns()} | fields)
     with _printing:
         print(line, flush=True)
