@@ -27,7 +27,7 @@ MAX_ALL_EARLY, MAX_EARLY_BYTES = 4096, 4 << 20  # out-of-order samples kept for 
 MAX_ASSEMBLIES, ASSEMBLY_TIMEOUT_S = 8, 5.0  # incomplete fragmented samples of one reader
 MIN_GREETING_S, MAX_GREETING_S = 0.5, 8.0  # period of requests for a first heartbeat; it doubles
 MAX_STRANGERS = 256  # writers that sent heartbeats before their announcement
-MIN_REQUEST_S = 0.005  # minimum time between two requests to a writer for missing samples
+MIN_REQUEST_S = 0.005  # minimum time between two requests because of samples out of order
 
 
 @dataclass(slots=True, eq=False)

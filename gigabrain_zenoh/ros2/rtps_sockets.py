@@ -48,7 +48,7 @@ class Sockets:
 
     async def open(self, receive: Callable[[bytes, str], None]) -> None:
         """Bind the ports of the first free participant. Raises BusError if there is none."""
-        # not with localhost: this socket would receive the groups that other processes joined
+        # none with localhost: it would also receive from groups that other processes joined
         self._group = None if self._localhost else self._group_socket()
         try:
             builtin, user = self._free_pair()
