@@ -110,7 +110,8 @@ class Guard:
             return f"cannot be started: {error}"
         assert process.stdout
         assert process.stdin
-        # the newest report without a fault: the first, or with readers, or if the driver has none
+        # time of the newest report that is no fault: the first one, one with readers, or any while
+        # the driver itself does not reach the robot
         well_ns: int | None = None
         try:
             while well_ns is None or self._clock.now_ns() - well_ns < LOST_NS:

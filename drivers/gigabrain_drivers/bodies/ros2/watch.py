@@ -16,10 +16,10 @@ from gigabrain_zenoh.geometry import se2
 LOST_PERIODS = 2.5  # the link is lost after this many periods without odometry,
 MIN_TIMEOUT_NS = 100_000_000  # but not before this time
 SETTLE_NS = 300_000_000  # a fault is over after this time of valid odometry
-PUSHED_FACTOR = 1.5  # a pushed body can move faster than its maximum speed by this factor
+PUSHED_FACTOR = 1.5  # a pushed body may reach this multiple of its maximum speed
 MAX_RATE_FACTOR = 3.0  # a reported turn rate above this multiple of the maximum is impossible
-JUMP_M, JUMP_RAD = 0.1, 0.3  # tolerances of the motion between two messages
-MAX_BACK_NS = 20_000_000  # a stamp may be this much older than the last, from another thread
+JUMP_M, JUMP_RAD = 0.1, 0.3  # a motion beyond the possible one by more than this is a jump
+MAX_BACK_NS = 20_000_000  # a stamp may be this much older than the last, if there are two threads
 
 
 class OdometrySample(NamedTuple):
