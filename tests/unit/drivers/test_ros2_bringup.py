@@ -1,4 +1,4 @@
-"""The bringup check names what is wrong with a ROS 2 robot, and what to do."""
+"""The bringup check names the faults of a ROS 2 robot, with remedies."""
 
 import asyncio
 import math
@@ -43,34 +43,34 @@ def options(**changes: Any) -> Ros2Options:
     return msgspec.convert(given | {"topics": topics}, Ros2Options)
 
 
-def end(
-    topic: str, type: str, kind: EndpointKind = "publisher", qos: Qos | None = None, **of: Any
+def endpoint(
+    topic: str, type: str, kind: EndpointKind = "publisher", qos: Qos | None = None, **fields: Any
 ) -> GraphEndpoint:
-    node = of.get("node", "/base")
-    return GraphEndpoint(node, kind, topic, type, "", qos or Qos(), of.get("ours", False))
+    node = fields.get("node", "/base")
+    return GraphEndpoint(node, kind, topic, type, "", qos or Qos(), fields.get("ours", False))
 
 
-GOOD = (
-    end("/odom", ODOMETRY),
-    end("/scan", SCAN, qos=SENSOR_DATA, node="/lidar"),
-    end("/cmd_vel", STAMPED, "subscriber"),
+GOOD_ENDPOINTS = (
+    endpoint("/odom", ODOMETRY),
+    endpoint("/scan", SCAN, qos=SENSOR_DATA, node="/lidar"),
+    endpoint("/cmd_vel", STAMPED, "subscriber"),
 )
 
 
 def only(found: list[Finding], what: str) -> Finding:
-    (one,) = [each for each in found if each.what == what]
-    return one
+    (finding,) = [each for each in found if each.what == what]
+    return finding
 
 
-def test_a_whole_robot_has_nothing_wrong() -> None:
-    found = graph_findings(options(), GOOD, LIDAR)
+def test_a_correct_robot_has_no_fault() -> None:
+    found = graph_findings(options(), GOOD_ENDPOINTS, LIDAR)
     assert {each.verdict for each in found} == {"ok"}
     assert [each.what for each in found] == ["/odom", "/scan", "/cmd_vel"]
-    assert explain(options(), GOOD) == ""
+    assert explain(options(), GOOD_ENDPOINTS) == ""
 
 
-def test_an_empty_graph_asks_for_domain_and_network() -> None:
-    ours = end("/cmd_vel", STAMPED, ours=True)
+def test_the_remedy_for_an_empty_graph_names_domain_and_network() -> None:
+    ours = endpoint("/cmd_vel", STAMPED, ours=True)
     (found,) = graph_findings(options(), [ours])
     assert (found.what, found.verdict) == ("graph", "error")
     assert "ROS_DOMAIN_ID=7" in found.do
@@ -81,59 +81,62 @@ def test_an_empty_graph_asks_for_domain_and_network() -> None:
 
 
 def test_a_missing_topic_is_named_with_others_of_its_type() -> None:
-    there = [end("/robot1/odom", ODOMETRY), *GOOD[1:]]
-    found = only(graph_findings(options(), there), "/odom")
+    endpoints = [endpoint("/robot1/odom", ODOMETRY), *GOOD_ENDPOINTS[1:]]
+    found = only(graph_findings(options(), endpoints), "/odom")
     assert (found.verdict, found.text) == ("error", "it has no publisher")
     assert "/robot1/odom; write it as topics.odometry.name, or set namespace" in found.do
-    assert graph_findings(options(namespace="/robot1"), there)[0].verdict == "ok"
+    assert graph_findings(options(namespace="/robot1"), endpoints)[0].verdict == "ok"
 
 
 def test_a_wrong_type_is_named() -> None:
-    there = [end("/odom", "geometry_msgs/msg/PoseStamped"), *GOOD[1:]]
-    found = only(graph_findings(options(), there), "/odom")
+    endpoints = [endpoint("/odom", "geometry_msgs/msg/PoseStamped"), *GOOD_ENDPOINTS[1:]]
+    found = only(graph_findings(options(), endpoints), "/odom")
     assert found.text == f"it is of type geometry_msgs/msg/PoseStamped; expected {ODOMETRY}"
-    there = [*GOOD[:2], end("/cmd_vel", TWIST, "subscriber")]
-    found = only(graph_findings(options(), there), "/cmd_vel")
+    endpoints = [*GOOD_ENDPOINTS[:2], endpoint("/cmd_vel", TWIST, "subscriber")]
+    found = only(graph_findings(options(), endpoints), "/cmd_vel")
     assert found.verdict == "error"
     assert found.do == f"write topics: {{command: {{type: {TWIST}}}}}"
 
 
-def test_quality_of_service_that_cannot_match_is_named() -> None:
+def test_a_mismatched_quality_of_service_is_named() -> None:
     wanted = options(topics={"scan": {"qos": "reliable"}})
-    found = only(graph_findings(wanted, GOOD), "/scan")
+    found = only(graph_findings(wanted, GOOD_ENDPOINTS), "/scan")
     assert found.verdict == "error"
     assert found.do == "write topics: {scan: {qos: best_effort}}"
     wanted = options(topics={"command": {"type": STAMPED, "qos": "best_effort"}})
-    found = only(graph_findings(wanted, GOOD), "/cmd_vel")
+    found = only(graph_findings(wanted, GOOD_ENDPOINTS), "/cmd_vel")
     assert found.do == "write topics: {command: {qos: reliable}}"
-    volatile = [*GOOD, end("/tf_static", TF)]
+    volatile = [*GOOD_ENDPOINTS, endpoint("/tf_static", TF)]
     found = only(graph_findings(options(mounting="tf_static"), volatile), "/tf_static")
     assert "volatile" in found.text
 
 
-def test_nobody_who_takes_commands_is_an_error_with_those_who_might() -> None:
-    there = [*GOOD[:2], end("/base/cmd", TWIST, "subscriber")]
-    found = only(graph_findings(options(), there), "/cmd_vel")
+def test_a_robot_that_takes_no_commands_is_an_error_with_alternatives() -> None:
+    endpoints = [*GOOD_ENDPOINTS[:2], endpoint("/base/cmd", TWIST, "subscriber")]
+    found = only(graph_findings(options(), endpoints), "/cmd_vel")
     assert (found.verdict, found.text) == ("error", "no node takes commands")
     assert "/base/cmd" in found.do
-    assert "/cmd_vel: no node takes commands" in explain(options(), there)
+    assert "/cmd_vel: no node takes commands" in explain(options(), endpoints)
 
 
 def test_another_commander_is_a_warning_but_our_driver_and_guard_are_not() -> None:
-    mine = [end("/cmd_vel", STAMPED, node=f"/gigabrain_driver{n}") for n in ("", "_guard")]
-    assert len(graph_findings(options(), [*GOOD, *mine])) == 3
-    there = [*GOOD, *mine, end("/cmd_vel", STAMPED, node="/teleop")]
-    *_, found = graph_findings(options(), there)
+    mine = [endpoint("/cmd_vel", STAMPED, node=f"/gigabrain_driver{n}") for n in ("", "_guard")]
+    assert len(graph_findings(options(), [*GOOD_ENDPOINTS, *mine])) == 3
+    endpoints = [*GOOD_ENDPOINTS, *mine, endpoint("/cmd_vel", STAMPED, node="/teleop")]
+    *_, found = graph_findings(options(), endpoints)
     assert (found.verdict, found.text) == ("warning", "commanded by /teleop as well")
 
 
 def test_two_publishers_of_one_topic_are_a_warning() -> None:
-    found = only(graph_findings(options(), [*GOOD, end("/odom", ODOMETRY, node="/ekf")]), "/odom")
+    found = only(
+        graph_findings(options(), [*GOOD_ENDPOINTS, endpoint("/odom", ODOMETRY, node="/ekf")]),
+        "/odom",
+    )
     assert (found.verdict, found.text) == ("warning", "2 publishers: /base, /ekf")
 
 
 def watched(statistics: dict[str, TopicStatistics], frames: FrameTree | None = None) -> Watched:
-    return Watched(GOOD, statistics, frames or FrameTree())
+    return Watched(GOOD_ENDPOINTS, statistics, frames or FrameTree())
 
 
 def statistics(hz: float = 20.0, offset_s: float = 0.01, **fields: Any) -> TopicStatistics:
@@ -141,11 +144,11 @@ def statistics(hz: float = 20.0, offset_s: float = 0.01, **fields: Any) -> Topic
     return TopicStatistics(101, 100 / hz, offset_s, stamp_s, **fields)
 
 
-SOUND = {"odometry": statistics(), "scan": statistics(10.0)}
+GOOD_STATISTICS = {"odometry": statistics(), "scan": statistics(10.0)}
 
 
-def test_messages_with_right_rates_and_stamps_are_fine() -> None:
-    found = findings(options(), LIDAR, watched(SOUND))
+def test_messages_with_correct_rates_and_stamps_are_ok() -> None:
+    found = findings(options(), LIDAR, watched(GOOD_STATISTICS))
     assert {each.verdict for each in found} == {"ok"}
     assert [each.what for each in found] == ["/odom", "/scan", "/cmd_vel", "/odom", "/scan"]
 
@@ -163,8 +166,8 @@ def test_messages_with_right_rates_and_stamps_are_fine() -> None:
         (statistics(offset_s=NOW_S, stamp_s=0.0), "error", "its stamps are 0"),
     ],
 )
-def test_messages_with_something_wrong(wrong: TopicStatistics, verdict: str, text: str) -> None:
-    found = findings(options(), LIDAR, watched(SOUND | {"odometry": wrong}))
+def test_faulty_messages_are_named(wrong: TopicStatistics, verdict: str, text: str) -> None:
+    found = findings(options(), LIDAR, watched(GOOD_STATISTICS | {"odometry": wrong}))
     bad = [each for each in found if each.what == "/odom" and each.verdict != "ok"]
     assert len(bad) == 1
     assert bad[0].verdict == verdict
@@ -172,7 +175,7 @@ def test_messages_with_something_wrong(wrong: TopicStatistics, verdict: str, tex
     assert bad[0].do
 
 
-def test_an_inertial_unit_without_orientation_is_a_warning() -> None:
+def test_an_imu_without_orientation_is_a_warning() -> None:
     imu = Types().make(
         IMU,
         header={"stamp": {"sec": int(NOW_S)}},
@@ -180,8 +183,10 @@ def test_an_inertial_unit_without_orientation_is_a_warning() -> None:
     )
     statistics = TopicStatistics()
     statistics.take(imu, int(NOW_S * 1e9), 0.0)
-    seen = Watched((*GOOD, end("/imu", IMU)), SOUND | {"imu": statistics})
-    found = findings(options(topics={"imu": {}}), LIDAR, seen)
+    results = Watched(
+        (*GOOD_ENDPOINTS, endpoint("/imu", IMU)), GOOD_STATISTICS | {"imu": statistics}
+    )
+    found = findings(options(topics={"imu": {}}), LIDAR, results)
     (wrong,) = (each for each in found if each.verdict != "ok")
     assert (wrong.what, wrong.verdict) == ("/imu", "warning")
     assert wrong.text.startswith("it has no orientation")
@@ -189,13 +194,13 @@ def test_an_inertial_unit_without_orientation_is_a_warning() -> None:
 
 
 def tree(types: Types, x: float, yaw: float = 0.0) -> FrameTree:
-    made = FrameTree()
+    frames = FrameTree()
     turn = {"z": math.sin(yaw / 2), "w": math.cos(yaw / 2)}
     for parent, child, at, rotation in (
         ("base_footprint", "base_link", 0.0, {"w": 1.0}),
         ("base_link", "base_scan", x, turn),
     ):
-        made.add(
+        frames.add(
             [
                 types.make(
                     "geometry_msgs/msg/TransformStamped",
@@ -205,18 +210,16 @@ def tree(types: Types, x: float, yaw: float = 0.0) -> FrameTree:
                 )
             ]
         )
-    return made
+    return frames
 
 
 @pytest.mark.parametrize(
     ("turned", "verdict"), [(math.pi, "ok"), (-3.12, "ok"), (-3.0, "warning"), (0.0, "warning")]
 )
-def test_a_lidar_that_looks_back_is_turned_by_half_a_turn_either_way(
-    turned: float, verdict: str
-) -> None:
+def test_a_yaw_of_half_a_turn_is_the_same_in_both_directions(turned: float, verdict: str) -> None:
     frames = tree(Types(), -0.032, turned)
-    seen = Watched(GOOD, {"scan": statistics(10.0, frame="base_scan")}, frames)
-    found = findings(options(), msgspec.structs.replace(LIDAR, yaw=math.pi), seen)
+    results = Watched(GOOD_ENDPOINTS, {"scan": statistics(10.0, frame="base_scan")}, frames)
+    found = findings(options(), msgspec.structs.replace(LIDAR, yaw=math.pi), results)
     assert only(found, "scan frame").verdict == verdict
 
 
@@ -231,16 +234,16 @@ def test_a_lidar_that_looks_back_is_turned_by_half_a_turn_either_way(
         ("tf_static", 0.1, "laser", "error", "frames of /tf_static: base_footprint, base_link"),
     ],
 )
-def test_frames_must_lead_to_the_base(
+def test_frames_must_be_connected_to_the_base(
     mounting: str, x: float, frame: str, verdict: str, text: str
 ) -> None:
     topics = {
         "odometry": statistics(child_frame="base_footprint"),
         "scan": statistics(10.0, frame=frame),
     }
-    graph = (*GOOD, end("/tf_static", TF, qos=LATCHED))
-    seen = Watched(graph, topics, tree(Types(), x))
-    found = only(findings(options(mounting=mounting), LIDAR, seen), "scan frame")
+    graph = (*GOOD_ENDPOINTS, endpoint("/tf_static", TF, qos=LATCHED))
+    results = Watched(graph, topics, tree(Types(), x))
+    found = only(findings(options(mounting=mounting), LIDAR, results), "scan frame")
     assert found.verdict == verdict
     assert text in found.text
 
@@ -248,7 +251,7 @@ def test_frames_must_lead_to_the_base(
 @pytest.mark.parametrize(
     ("last", "problem"), [(83.0, "its percentage is 83; expected 0 to 1"), (0.83, "")]
 )
-async def test_a_watch_tells_why_the_driver_drops_the_newest_message(
+async def test_a_watch_reports_why_the_driver_drops_the_newest_message(
     last: float, problem: str
 ) -> None:
     kind, types = "sensor_msgs/msg/BatteryState", Types()

@@ -1,4 +1,4 @@
-"""ROS messages as ours: angles, ranges, mountings, and what is no measurement."""
+"""Conversion of ROS messages to ours: angles, ranges, mountings, and invalid values."""
 
 import math
 from typing import Any, Literal
@@ -46,7 +46,7 @@ def scan(types: Types, ranges: list[float], **fields: Any) -> Any:
 
 
 def ranges_of(found: Any) -> list[float]:
-    return [round(float(one), 3) for one in np.frombuffer(found.ranges, "<f4")]
+    return [round(float(each), 3) for each in np.frombuffer(found.ranges, "<f4")]
 
 
 ONE_TO_8 = [1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0]
@@ -71,7 +71,7 @@ def test_beams_run_counter_clockwise_from_ahead(
     assert (found.angle_min, found.range_max) == (0.0, 8.0)
 
 
-def test_what_is_no_distance_gets_its_meaning(types: Types) -> None:
+def test_ranges_that_are_no_distances_have_the_configured_meaning(types: Types) -> None:
     given = [NAN, 0.0, INF, -INF, -1.0, 0.05, 9.0, 1.0]
     found = ranges_of(scan_of(scan(types, given), ScanTopic(), LIDAR))
     np.testing.assert_equal(found, [NAN, INF, INF, 0.1, NAN, 0.1, INF, 1.0])
@@ -80,9 +80,9 @@ def test_what_is_no_distance_gets_its_meaning(types: Types) -> None:
     np.testing.assert_equal(found[:2], [INF, NAN])
 
 
-def test_more_or_fewer_beams_fall_into_ours(types: Types) -> None:
+def test_more_or_fewer_beams_are_put_into_our_bins(types: Types) -> None:
     many = ranges_of(scan_of(scan(types, [2.0] * 37 + [1.0] + [2.0] * 192), ScanTopic(), LIDAR))
-    assert many == [2.0, 1.0, *[2.0] * 6]  # of all in a bin the nearest
+    assert many == [2.0, 1.0, *[2.0] * 6]  # the nearest of all beams in a bin
     few = ranges_of(scan_of(scan(types, [2.0] * 4), ScanTopic(), LIDAR))
     np.testing.assert_equal(few, [2.0, NAN] * 4)
 
@@ -91,7 +91,7 @@ def test_more_or_fewer_beams_fall_into_ours(types: Types) -> None:
     "fields",
     [{"angle_increment": 0.0}, {"angle_increment": NAN}, {"angle_min": INF}],
 )
-def test_impossible_scans_are_refused(types: Types, fields: dict[str, float]) -> None:
+def test_impossible_scans_are_rejected(types: Types, fields: dict[str, float]) -> None:
     with pytest.raises(Unusable):
         scan_of(scan(types, ONE_TO_8, **fields), ScanTopic(), LIDAR)
     empty = types.make("sensor_msgs/msg/LaserScan")
@@ -99,8 +99,8 @@ def test_impossible_scans_are_refused(types: Types, fields: dict[str, float]) ->
         scan_of(empty, ScanTopic(), LIDAR)
 
 
-def test_a_scan_is_moved_to_where_our_lidar_sits(types: Types) -> None:
-    # 8 beams in a round wall of 2 m; the sensor looks backwards and sits 0.5 m ahead of ours
+def test_a_scan_is_transformed_to_the_mounting_of_our_lidar(types: Types) -> None:
+    # 8 beams inside a round wall of 2 m; the sensor faces backwards, 0.5 m ahead of our lidar
     given = scan(types, [2.0, INF, 2.0, INF, 2.0, INF, 2.0, INF])
     found = ranges_of(scan_of(given, ScanTopic(), LIDAR, planar(0.5, 0.0, math.pi)))
     assert found[0] == 2.5
@@ -108,13 +108,13 @@ def test_a_scan_is_moved_to_where_our_lidar_sits(types: Types) -> None:
     assert found[3] == INF
 
 
-def test_a_lidar_that_hangs_upside_down_runs_the_other_way(types: Types) -> None:
+def test_the_beams_of_an_upside_down_lidar_are_reversed(types: Types) -> None:
     down = Transform(np.diag([1.0, -1.0, -1.0]), np.zeros(3))
     found = scan_of(scan(types, ONE_TO_8), ScanTopic(), LIDAR, down)
     assert ranges_of(found) == [1, 8, 7, 6, 5, 4, 3, 2]
 
 
-def test_the_inertial_unit_is_turned_into_the_bodys_frame(types: Types) -> None:
+def test_imu_values_are_rotated_into_the_bodys_frame(types: Types) -> None:
     half = math.sin(math.pi / 4)
     message = types.make(
         "sensor_msgs/msg/Imu",
@@ -132,7 +132,7 @@ def test_the_inertial_unit_is_turned_into_the_bodys_frame(types: Types) -> None:
 
 
 @pytest.mark.parametrize("orientation", [{}, {"w": 0.0}, {"w": NAN}, {"x": 1.0, "w": 0.0}])
-def test_an_inertial_unit_without_orientation_is_not_level(
+def test_an_imu_without_orientation_has_no_tilt(
     types: Types, orientation: dict[str, float]
 ) -> None:
     message = types.make(
@@ -157,13 +157,13 @@ def test_an_inertial_unit_without_orientation_is_not_level(
         {"linear_acceleration": {"x": 1e6}},
     ],
 )
-def test_an_impossible_inertial_unit_is_refused(types: Types, fields: dict[str, Any]) -> None:
+def test_impossible_imu_values_are_rejected(types: Types, fields: dict[str, Any]) -> None:
     message = types.make("sensor_msgs/msg/Imu", **fields)
     with pytest.raises(Unusable):
         imu_of(message)
 
 
-def test_yaw_needs_a_quaternion(types: Types) -> None:
+def test_a_yaw_from_an_invalid_quaternion_is_rejected(types: Types) -> None:
     half = math.sin(math.pi / 4)
     right = types.make("geometry_msgs/msg/Quaternion", z=half, w=half)
     assert yaw_of(right) == pytest.approx(math.pi / 2)
@@ -171,7 +171,7 @@ def test_yaw_needs_a_quaternion(types: Types) -> None:
         yaw_of(types.make("geometry_msgs/msg/Quaternion", w=0.0))
 
 
-def test_batteries_have_percent_and_their_current_the_other_sign(types: Types) -> None:
+def test_a_battery_has_percent_and_the_opposite_sign_of_current(types: Types) -> None:
     kind = "sensor_msgs/msg/BatteryState"
     message = types.make(kind, voltage=12.0, percentage=0.75, current=-1.5)
     found = battery_of(message, BatteryTopic())
@@ -192,7 +192,7 @@ def test_batteries_have_percent_and_their_current_the_other_sign(types: Types) -
         (-1.0, 1, "its percentage is -1; expected 0 to 1"),
     ],
 )
-def test_a_charge_that_cannot_be_is_no_full_or_empty_battery(
+def test_an_impossible_charge_is_rejected(
     types: Types, percentage: float, full: Literal[1, 100], text: str
 ) -> None:
     message = types.make("sensor_msgs/msg/BatteryState", voltage=12.0, percentage=percentage)
@@ -201,7 +201,7 @@ def test_a_charge_that_cannot_be_is_no_full_or_empty_battery(
     assert str(error.value) == text
 
 
-def test_a_charge_just_above_full_is_full(types: Types) -> None:
+def test_a_charge_slightly_above_full_is_full(types: Types) -> None:
     message = types.make("sensor_msgs/msg/BatteryState", voltage=12.6, percentage=1.03)
     assert battery_of(message, BatteryTopic()).percentage == 100.0
 
@@ -219,14 +219,14 @@ def test_joints_have_names_positions_and_velocities(types: Types) -> None:
             joints_of(types.make(kind, name=["l", "r"], position=wrong), JointsTopic())
 
 
-def test_a_speed_is_cut_to_what_the_robot_does_and_survives_its_truncation(types: Types) -> None:
+def test_a_speed_is_cut_to_steps_and_keeps_them_in_the_robots_truncation(types: Types) -> None:
     sent = cut(Velocity(linear_x=0.2999, linear_y=-0.0, angular_z=-1.239), 0.01)
     assert (sent.linear_x, sent.angular_z) == pytest.approx((0.29, -1.23))
     topic = CommandTopic(type=TWIST, step=0.01)
     for hundredths in range(-300, 301):
         to = cut(Velocity(linear_x=hundredths / 100), 0.01)
         message = command_message(types, to, topic, 0)
-        assert int(message.linear.x * 100) == hundredths  # as turtlebot3_node does
+        assert int(message.linear.x * 100) == hundredths  # as in turtlebot3_node
 
 
 def test_a_stamped_command_has_frame_and_time(types: Types) -> None:
@@ -269,7 +269,7 @@ def test_frames_are_found_through_their_common_ancestor(types: Types) -> None:
     assert tree.find("base_link", "base_link")
 
 
-def test_frames_in_a_circle_or_without_numbers_do_no_harm(types: Types) -> None:
+def test_frames_in_a_cycle_or_with_invalid_numbers_are_not_connected(types: Types) -> None:
     tree = FrameTree()
     tree.add([link(types, "a", "b", 1.0), link(types, "b", "a", 1.0), link(types, "b", "c", NAN)])
     assert tree.find("a", "root") is None

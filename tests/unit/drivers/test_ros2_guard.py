@@ -1,4 +1,4 @@
-"""The driver's end of a ROS 2 robot's guard: a guard that fails is named, and started again."""
+"""The driver's side of a ROS 2 robot's guard: a failed guard is reported and restarted."""
 
 import sys
 from pathlib import Path
@@ -23,7 +23,7 @@ GOOD = "#!/bin/sh\necho 1\ncat > /dev/null\n"
         ("#!/bin/sh\n", "has ended"),
     ],
 )
-async def test_a_guard_that_fails_is_named_and_started_again(
+async def test_a_failed_guard_is_reported_and_restarted(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, program: str | None, fault: str
 ) -> None:
     monkeypatch.setattr(guards, "RESTART_NS", 1_000_000)

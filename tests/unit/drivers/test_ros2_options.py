@@ -1,4 +1,4 @@
-"""A ROS 2 robot in YAML: what is wrong in it is refused with its field and its line."""
+"""A ROS 2 robot in YAML: a wrong value is rejected with its field and line."""
 
 from pathlib import Path
 
@@ -80,7 +80,7 @@ def options_of(path: Path, text: str) -> Ros2Options:
         ),
     ],
 )
-def test_what_cannot_be_is_refused_with_its_line(
+def test_a_wrong_value_is_rejected_with_its_line(
     right: str, wrong: str, complaint: str, tmp_path: Path
 ) -> None:
     assert right in ROBOT
@@ -88,21 +88,21 @@ def test_what_cannot_be_is_refused_with_its_line(
         options_of(tmp_path, ROBOT.replace(right, wrong))
 
 
-def test_a_step_must_suit_the_speed_of_the_body(tmp_path: Path) -> None:
+def test_a_step_that_is_too_coarse_for_the_body_is_rejected(tmp_path: Path) -> None:
     text = ROBOT.replace("hz: 20", "step: 0.1").replace("speed: 0.5", "speed: 0.3")
     with pytest.raises(ConfigError, match=r"step of 0\.1 is too coarse for a body that does 0\.3"):
         options_of(tmp_path, text)
 
 
 @pytest.mark.parametrize(("watchdog", "guarded"), [("none", True), ("0.5", True), ("0.2", False)])
-def test_a_robot_that_drives_on_for_long_gets_a_guard(
+def test_a_robot_with_a_long_watchdog_or_none_gets_a_guard(
     watchdog: str, guarded: bool, tmp_path: Path
 ) -> None:
     text = ROBOT.replace("watchdog: 0.5", f"watchdog: {watchdog}")
     assert options_of(tmp_path, text).needs_guard is guarded
 
 
-def test_the_link_says_how_to_join(tmp_path: Path) -> None:
+def test_the_link_has_the_settings_to_join(tmp_path: Path) -> None:
     link = options_of(tmp_path, ROBOT).link()
     assert (link.transport, link.domain, link.node) == ("dds", 5, "gigabrain_driver")
 
@@ -120,7 +120,7 @@ def test_an_emulators_address_replaces_domain_and_router(tmp_path: Path) -> None
     assert Address(router="tcp/127.0.0.1:1").domain == 0
 
 
-def test_the_shipped_turtlebot3_is_what_its_nodes_are() -> None:
+def test_the_shipped_turtlebot3_has_the_topics_of_its_nodes() -> None:
     run = Run(folder=Path(), link="real")
     robot, _, options, _ = catalog.load_link("turtlebot3_ros2", run)
     assert isinstance(options, Ros2Options)

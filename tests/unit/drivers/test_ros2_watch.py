@@ -1,4 +1,4 @@
-"""Odometry of a ROS 2 robot: what is wrong with it is named, and its pose never jumps."""
+"""Odometry of a ROS 2 robot: faults are named, and the pose never jumps."""
 
 import math
 
@@ -36,9 +36,9 @@ class Robot:
 
 @pytest.fixture
 def robot() -> Robot:
-    made = Robot()
-    made.report(4)
-    return made
+    robot = Robot()
+    robot.report(4)
+    return robot
 
 
 def test_good_odometry_has_no_problem(robot: Robot) -> None:
@@ -47,11 +47,11 @@ def test_good_odometry_has_no_problem(robot: Robot) -> None:
     assert robot.watch.velocity.linear_x == 0.2
 
 
-def test_nothing_yet_is_a_problem() -> None:
+def test_no_message_yet_is_a_problem() -> None:
     assert Robot().problem == "odom: no message yet"
 
 
-def test_silence_is_lost_after_two_and_a_half_periods(robot: Robot) -> None:
+def test_silence_is_a_problem_after_two_and_a_half_periods(robot: Robot) -> None:
     robot.now_ns += 125 * MS
     assert robot.problem == ""
     robot.now_ns += MS
@@ -61,7 +61,7 @@ def test_silence_is_lost_after_two_and_a_half_periods(robot: Robot) -> None:
 
 
 @pytest.mark.parametrize("field", ["linear_x", "angular_z"])
-def test_nan_is_named_at_once_and_settles(robot: Robot, field: str) -> None:
+def test_nan_is_a_problem_until_odometry_was_valid_for_a_while(robot: Robot, field: str) -> None:
     robot.report(**{field: math.nan})
     assert "NaN" in robot.problem
     assert robot.watch.velocity.linear_x == 0.2
@@ -72,7 +72,7 @@ def test_nan_is_named_at_once_and_settles(robot: Robot, field: str) -> None:
     assert robot.watch.errors == 1
 
 
-def test_stamps_that_go_back_are_named(robot: Robot) -> None:
+def test_stamps_that_go_back_are_a_problem(robot: Robot) -> None:
     robot.stamp_ns -= 5_000 * MS
     robot.report()
     assert "stamps went back by 4.95 s" in robot.problem
@@ -80,20 +80,20 @@ def test_stamps_that_go_back_are_named(robot: Robot) -> None:
     assert robot.problem == ""
 
 
-def test_a_little_disorder_of_stamps_is_borne(robot: Robot) -> None:
+def test_stamps_that_go_back_a_little_are_accepted(robot: Robot) -> None:
     robot.stamp_ns -= 60 * MS
     robot.report()
     assert robot.problem == ""
 
 
-def test_a_message_that_is_repeated_for_ever_is_no_odometry(robot: Robot) -> None:
+def test_a_constantly_repeated_message_is_a_problem(robot: Robot) -> None:
     for _ in range(5):
         robot.stamp_ns -= PERIOD_NS
         robot.report()
     assert "stand still" in robot.problem
 
 
-def test_a_restarted_robot_is_lost_for_a_moment_and_the_pose_goes_on(robot: Robot) -> None:
+def test_after_a_restart_of_the_robot_the_pose_continues_without_a_jump(robot: Robot) -> None:
     robot.report(100)
     before = robot.watch.pose.x
     assert before == pytest.approx(1.04)
@@ -117,16 +117,16 @@ def test_a_body_that_is_pushed_or_late_has_not_jumped(robot: Robot) -> None:
     assert robot.problem == ""
 
 
-def test_a_turn_rate_that_cannot_be_is_taken_from_the_pose(robot: Robot) -> None:
+def test_an_impossible_turn_rate_is_replaced_by_that_of_the_poses(robot: Robot) -> None:
     robot.yaw = math.pi - 0.01
     robot.report(20)
-    robot.yaw = -math.pi + 0.04  # 0.05 rad further
+    robot.yaw = -math.pi + 0.04  # 0.05 rad more
     robot.report(angular_z=-124.7)
     assert robot.watch.velocity.angular_z == pytest.approx(1.0)
     assert robot.watch.velocity.linear_x == 0.2
 
 
-def test_a_new_transport_starts_again(robot: Robot) -> None:
+def test_with_a_new_transport_old_messages_do_not_count(robot: Robot) -> None:
     robot.watch.restart()
     assert robot.problem == "odom: no message yet"
     robot.report()
