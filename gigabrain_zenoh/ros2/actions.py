@@ -257,7 +257,7 @@ class ActionServer:
             self._end_events.pop(goal.id).set()
 
     def _publish_feedback(self, goal: Goal, fields: Any) -> None:
-        """Publish the feedback of an active goal, unless nobody subscribes."""
+        """Publish the feedback of an active goal, if there are subscribers."""
         publishers = [each for each in self._feedback if each.readers]
         if publishers and goal.active:
             fields = self._message("Feedback", fields)

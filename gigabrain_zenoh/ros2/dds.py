@@ -299,8 +299,8 @@ class DdsTransport:
         self._references += [topic, reader]
         self._publish_graph()
 
-    def _watch(self, topic: Any, take: Callable[[Any], None]) -> None:
-        """Call `take` for each sample of a built-in topic: changes of participants or endpoints."""
+    def _watch(self, topic: Any, on_sample: Callable[[Any], None]) -> None:
+        """Call `on_sample` for each sample of a built-in topic, which lists DDS entities."""
         reader = BuiltinDataReader(self._participant, topic)
 
         def read() -> bool:
@@ -311,15 +311,15 @@ class DdsTransport:
                 log.debug("an endpoint cannot be read: %s", error)
                 return False
             for sample in taken:
-                take(sample)
+                on_sample(sample)
             return len(taken) == MAX_DEPTH
 
         self._listen(reader, read)
         self._references.append(reader)
 
-    def _listen(self, reader: Entity, take: Callable[[], bool]) -> None:
-        """Have the loop call `take` when a reader has data, and again while it returns True."""
-        self._watcher.watch(reader, DDSStatus.DataAvailable, _PendingCall(self._bridge, take))
+    def _listen(self, reader: Entity, read: Callable[[], bool]) -> None:
+        """Call `read` in the loop when a reader has data, and again while it returns True."""
+        self._watcher.watch(reader, DDSStatus.DataAvailable, _PendingCall(self._bridge, read))
 
     def _on_discovery(self, received: Received) -> None:
         try:

@@ -141,7 +141,7 @@ class DdsGraph:
         return tuple(node.name for nodes in self._nodes.values() for node in nodes)
 
     def endpoints(self) -> tuple[GraphEndpoint, ...]:
-        """Return all ROS endpoints. A server or client, which has two DDS endpoints, is one."""
+        """Return all ROS endpoints. The two DDS endpoints of a server or client are one."""
         owners = {
             gid: node.name for nodes in self._nodes.values() for node in nodes for gid in node.gids
         }

@@ -30,7 +30,7 @@ log = logging.getLogger(__name__)
 
 
 class MemoryEndpoint:
-    """One endpoint of a node on a MemoryNetwork; a publisher is one of these as well."""
+    """One endpoint of a node on a MemoryNetwork; its publish method is for publishers."""
 
     def __init__(
         self, node: "MemoryTransport", kind: EndpointKind, topic: str, type: str, qos: Qos
@@ -91,7 +91,7 @@ class MemoryNetwork:
         self._count_readers()
 
     def matching(self, writer: MemoryEndpoint) -> list[MemoryEndpoint]:
-        """Return the matched subscribers, which are of other nodes; empty unless a publisher."""
+        """Return the matched subscribers of other nodes; empty if `writer` is not a publisher."""
         if writer.kind != "publisher":
             return []
         return [

@@ -140,14 +140,14 @@ class RmwZenohPublisher:
             congestion_control=zenoh.CongestionControl.DROP,
             allowed_destination=REMOTE,
         )
-        made: list[Any] = [plain]
+        declared: list[Any] = [plain]
         if entity.qos.transient_local:
-            made.append(advanced_publisher(session, entity.key, entity.qos))
-        made.append(plain.declare_matching_listener(line.guard(self._on_matching)))
-        made.append(entity.declare_token(line))
-        self._put = made[1 if entity.qos.transient_local else 0].put
+            declared.append(advanced_publisher(session, entity.key, entity.qos))
+        declared.append(plain.declare_matching_listener(line.guard(self._on_matching)))
+        declared.append(entity.declare_token(line))
+        self._put = declared[1 if entity.qos.transient_local else 0].put
         self._match(has_subscriber(plain))
-        return Bundle(*made)
+        return Bundle(*declared)
 
     def _on_matching(self, status: zenoh.MatchingStatus) -> None:
         self._home.bridge.post(self._match, status.matching)
@@ -208,9 +208,9 @@ class RmwZenohTransport:
     ) -> RmwZenohPublisher:
         """Declare a publisher."""
         entity = _Entity(self, "publisher", topic, type, qos)
-        made = RmwZenohPublisher(self, entity, on_readers)
-        self.publishers.add(made)
-        return made
+        publisher = RmwZenohPublisher(self, entity, on_readers)
+        self.publishers.add(publisher)
+        return publisher
 
     def subscribe(self, topic: str, type: str, qos: Qos, handle: OnReceived) -> Close:
         """Call `handle` for each message; up to `qos.depth` newest ones wait for a busy loop."""
@@ -226,8 +226,8 @@ class RmwZenohTransport:
         mailbox = Mailbox(self.bridge, deliver, qos.depth)
 
         def declare(line: OpenSession) -> Bundle:
-            made = subscriber(line.session, entity.key, qos, line.guard(mailbox.put))
-            return Bundle(made, entity.declare_token(line))
+            declared = subscriber(line.session, entity.key, qos, line.guard(mailbox.put))
+            return Bundle(declared, entity.declare_token(line))
 
         self.subscribers.add(entity)
         undeclare = self.lines.declare(declare)

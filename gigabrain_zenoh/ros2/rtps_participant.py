@@ -146,7 +146,7 @@ class Participant:
             self._dispatch(message.prefix, submessage)
 
     def tick(self, now: float) -> float:
-        """Do what is due; return the seconds until the next tick."""
+        """Drop expired participants, send due messages; return the time to the next tick [s]."""
         self._now = now
         for prefix, remote in list(self.remotes.items()):
             lease = min(max(remote.data.lease_s, MIN_LEASE_S), MAX_LEASE_S)

@@ -180,7 +180,7 @@ def encode_message(prefix: bytes, to: bytes, submessages: Iterable[Submessage], 
         parts.append(_submessage(_INFO_DST, 1, to))
     fraction = (ns % 1_000_000_000 << 32) // 1_000_000_000
     parts.append(_submessage(_INFO_TS, 1, struct.pack("<II", ns // 1_000_000_000, fraction)))
-    parts.extend(one.encode() for one in submessages)
+    parts.extend(each.encode() for each in submessages)
     return b"".join(parts)
 
 
