@@ -76,7 +76,7 @@ class Ros2Driver(Driver):
         self._clock = clock or Clock()
         topics = options.topics
         self.link = RosLink(options, self._clock, opener)
-        self.link.on_open = self._opened
+        self.link.on_open = self._on_open
         guarded = options.needs_guard and not opener
         self._guard = Guard(options, self._clock, lambda: self.link.readers) if guarded else None
         self._watch = OdometryWatch(
@@ -183,21 +183,21 @@ class Ros2Driver(Driver):
     def _listen(self) -> None:
         topics, listen = self.options.topics, self.link.listen
         rows = (
-            (topics.odometry, ros2.ODOMETRY, self._take_odometry),
-            (topics.scan, ros2.SCAN, self._take_scan),
-            (topics.imu, ros2.IMU, self._take_imu),
-            (topics.battery, ros2.BATTERY, self._take_battery),
-            (topics.joints, ros2.JOINTS, self._take_joints),
+            (topics.odometry, ros2.ODOMETRY, self._on_odometry),
+            (topics.scan, ros2.SCAN, self._on_scan),
+            (topics.imu, ros2.IMU, self._on_imu),
+            (topics.battery, ros2.BATTERY, self._on_battery),
+            (topics.joints, ros2.JOINTS, self._on_joints),
         )
-        for topic, type, take in rows:
+        for topic, type, handle in rows:
             if topic:
-                listen(topic.name, type, take, reliable=topic.qos == "reliable")
+                listen(topic.name, type, handle, reliable=topic.qos == "reliable")
         if topics.imu:
             self.sensors["imu"] = None
         if self.options.mounting == "tf_static":
-            listen(ros2.TF_STATIC_TOPIC, ros2.TF, self._take_frames, reliable=True, kept=True)
+            listen(ros2.TF_STATIC_TOPIC, ros2.TF, self._on_frames, reliable=True, kept=True)
 
-    def _opened(self) -> None:
+    def _on_open(self) -> None:
         self._watch.restart()
         self._send(ZERO)
 
@@ -246,7 +246,7 @@ class Ros2Driver(Driver):
         self._fault.end(f"{self.link}: now something else is wrong")
         self._fault.begin(f"{self.link}: {problem}{'; ' if more else ''}{more}")
 
-    def _take_odometry(self, message: Any) -> None:
+    def _on_odometry(self, message: Any) -> None:
         now_ns = self._clock.now_ns()
         try:
             place = self._place_of_odometry(message.child_frame_id)
@@ -284,7 +284,7 @@ class Ros2Driver(Driver):
             )
         return place
 
-    def _take_scan(self, message: Any) -> None:
+    def _on_scan(self, message: Any) -> None:
         lidar, options = self.robot.lidar, self.options.topics.scan
         place = None
         if self.options.mounting == "tf_static":
@@ -297,7 +297,7 @@ class Ros2Driver(Driver):
         assert lidar
         self.publish("scan", SCAN, scan_of(message, options, lidar, place))
 
-    def _take_imu(self, message: Any) -> None:
+    def _on_imu(self, message: Any) -> None:
         topic, turn = self.options.topics.imu, None
         if self.options.mounting == "tf_static":
             turn = self._frame(message.header.frame_id).turn
@@ -311,15 +311,15 @@ class Ros2Driver(Driver):
         self._imu.put(data, self._clock.now_ns())
         self.publish("imu", IMU, Imu(**asdict(data)))
 
-    def _take_battery(self, message: Any) -> None:
+    def _on_battery(self, message: Any) -> None:
         battery = battery_of(message, self.options.topics.battery)
         self._battery.put(battery, self._clock.now_ns())
 
-    def _take_joints(self, message: Any) -> None:
+    def _on_joints(self, message: Any) -> None:
         joints = joints_of(message, self.options.topics.joints)
         self._joints.put(joints, self._clock.now_ns())
 
-    def _take_frames(self, message: Any) -> None:
+    def _on_frames(self, message: Any) -> None:
         self._frames.add(message.transforms)
 
 

@@ -44,7 +44,8 @@ class Guard:
         self._options, self._clock, self._reached = options, clock, reached
         self._process: asyncio.subprocess.Process | None = None
         self._received_ns: int | None = None
-        self._readers, self._fault = 0, ""  # of the present process; of the previous process
+        self._readers = 0  # nodes that subscribe to the commands of the process
+        self._fault = ""  # of the previous process
         self._task: asyncio.Task[None] | None = None
 
     @property

@@ -34,7 +34,7 @@ DEPTH = 5  # messages that wait for a busy loop
 STATIC_DEPTH = 100  # for /tf_static, where each publisher keeps one message
 
 Opener = Callable[[], AbstractAsyncContextManager[RosTransport]]
-Take = Callable[[Any], None]  # handles a message; may raise Unusable
+Handler = Callable[[Any], None]  # handles a message; may raise Unusable
 
 
 @functools.cache
@@ -57,7 +57,7 @@ class RosLink:
         self.problem = "not opened"
         self.errors = 0  # number of unusable messages
         self.transport: RosTransport | None = None
-        self._topics: list[tuple[str, str, Qos, Take]] = []
+        self._topics: list[tuple[str, str, Qos, Handler]] = []
         self._faults: dict[str, Fault] = {}
         self._command: RosPublisher | None = None
         self._task: asyncio.Task[None] | None = None
@@ -75,11 +75,11 @@ class RosLink:
         return self._command.readers if self._command else 0
 
     def listen(
-        self, topic: str, type: str, take: Take, *, reliable: bool, kept: bool = False
+        self, topic: str, type: str, handle: Handler, *, reliable: bool, kept: bool = False
     ) -> None:
-        """Call `take` with each message; `kept`: also with stored ones. Call this before `open`."""
+        """Call `handle` for each message; `kept`: also for stored ones. Use it before `open`."""
         qos = Qos(reliable, kept, STATIC_DEPTH if kept else DEPTH)
-        self._topics.append((topic, type, qos, take))
+        self._topics.append((topic, type, qos, handle))
 
     def open(self) -> None:
         """Start to join in the background."""
@@ -151,17 +151,17 @@ class RosLink:
         self._command = transport.publisher(
             command.name, command.type, Qos(command.qos == "reliable", depth=1)
         )
-        for topic, type, qos, take in self._topics:
-            handle = functools.partial(self._on_message, topic, type, take)
-            transport.subscribe(topic, type, qos, handle)
+        for topic, type, qos, handle in self._topics:
+            on_received = functools.partial(self._on_message, topic, type, handle)
+            transport.subscribe(topic, type, qos, on_received)
         self.on_open()
 
-    def _on_message(self, topic: str, type: str, take: Take, received: Received) -> None:
+    def _on_message(self, topic: str, type: str, handle: Handler, received: Received) -> None:
         self._log_message("rx", topic, type, received.payload)
         fault = self._faults.setdefault(topic, Fault(log))
         assert self._types
         try:
-            take(self._types.decode(type, received.payload))
+            handle(self._types.decode(type, received.payload))
         except (BadPayload, Unusable) as error:
             self.errors += 1
             fault.begin(f"{topic}: a message was dropped: {error}")
