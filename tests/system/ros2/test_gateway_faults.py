@@ -96,7 +96,7 @@ async def test_a_frozen_gateway_stops_the_body_and_its_backlog_moves_nothing(
     await robot.becomes("idle")
 
 
-async def test_a_gateway_killed_while_ros_drives_stops_the_body_and_asks_for_it_again(
+async def test_a_gateway_killed_while_ros_drives_stops_the_body_and_drives_again_later(
     driven: tuple[Robot, Any],
 ) -> None:
     robot, driver = driven

@@ -130,7 +130,7 @@ def frames(transforms: Any) -> set[str]:
 
 
 def complete(report: Any) -> bool:
-    """Return whether a topic has come, and if it has frames, more than that of the base.
+    """Return whether a message has arrived; one with frames must have more than the base's.
 
     The gateway knows the body's description up to a second later than the first state.
     """

@@ -171,7 +171,7 @@ def test_a_participant_that_dies_is_forgotten_after_its_lease():
     assert not writer.readers
 
 
-def test_nothing_is_sent_to_a_participant_that_is_gone():
+def test_nothing_is_sent_to_a_participant_whose_lease_has_expired():
     network = Network()
     one, two = network.join(1), network.join(2)
     add_writer(network, one)
