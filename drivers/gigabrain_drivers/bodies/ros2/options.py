@@ -121,7 +121,7 @@ class Ros2Options(LinkOptions, frozen=True, kw_only=True, forbid_unknown_fields=
     localhost: bool = False  # true: DDS connects only to nodes of this host
     port: str = ""  # file with an emulator's address, which replaces domain and router
     topics: Topics
-    watchdog: Seconds | Literal["none"]  # [s], after which a robot without commands stops
+    watchdog: Seconds | Literal["none"]  # [s], time without commands until the robot stops
     mounting: Literal["file", "tf_static"] = "file"  # source of sensor mountings: this file, or ROS
     base_frame: Frame = "base_footprint"  # the body's frame in ROS
 
