@@ -14,6 +14,7 @@ from gigabrain_schemas.examples import EXAMPLES
 from gigabrain_schemas.sensors import LaserScan
 from gigabrain_schemas.topics import SCAN
 from gigabrain_zenoh.testing.waiting import until
+from gigabrain_zenoh.ui.foxglove import node
 from gigabrain_zenoh.ui.foxglove.access import topic_to_steer
 from gigabrain_zenoh.ui.foxglove.node import velocity_of
 from tests.system.foxglove_bridge import Bridge, bridged, hold
@@ -76,6 +77,22 @@ async def test_a_viewer_without_the_secret_topic_cannot_steer(bridge: Bridge, to
             await asyncio.sleep(0.02)
         await hold(owner, LEFT, lambda: bridge.turns)
     assert -0.5 not in bridge.turns
+
+
+async def test_every_refused_viewer_is_logged_once_however_many_there_are(
+    bridge: Bridge, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    def refusals() -> int:
+        return sum("may not steer" in record.message for record in caplog.records)
+
+    monkeypatch.setattr(node, "MAX_REFUSED", 2)
+    for number in range(1, 5):
+        async with bridge.viewer() as stranger:
+            for topic in ("/teleop", "/cmd_vel"):
+                await stranger.publish_on(topic)
+            await until(lambda: refusals() == number, "a refusal in the log")
+            await asyncio.sleep(0.05)
+        assert refusals() == number
 
 
 async def test_noise_floods_and_vanishing_viewers_disturb_no_other(bridge: Bridge) -> None:

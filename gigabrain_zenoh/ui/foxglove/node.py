@@ -62,6 +62,7 @@ MAX_WAITING_MESSAGES = 64  # for a slow viewer; the oldest are dropped
 NAME = "gigabrain"
 MAX_MESSAGE_BYTES = 1024
 MAX_CHANNELS = 64  # of all viewers
+MAX_REFUSED = 64  # newest refused viewers, each logged once
 FEED_TOPICS = (IMAGE, DEPTH, PERCEIVED, DETECTIONS)
 
 
@@ -192,7 +193,7 @@ class FoxgloveSteering(ServerListener):
         self._loop = asyncio.get_running_loop()
         self._rates = RateLimiter()
         self._channels: set[tuple[int, int]] = set()  # viewer and channel that may steer
-        self._refused: set[int] = set()  # viewers whose refusal was logged
+        self._refused: dict[int, None] = {}  # viewers whose refusal was logged
         self.graph_wanted = self.parameters_wanted = False
         self.requests = FoxgloveRequests(
             view.bus, view.state.fresh, view.health.keys, self.may_steer
@@ -266,7 +267,7 @@ class FoxgloveSteering(ServerListener):
     def _close_channel(self, viewer: int, channel: int) -> None:
         if (viewer, channel) in self._channels:
             self._channels.discard((viewer, channel))
-            self._refused.discard(viewer)
+            self._refused.pop(viewer, None)
             self._arbiter.leave(viewer)
 
     def _process(self, viewer: int, channel: int, data: bytes) -> None:
@@ -283,8 +284,8 @@ class FoxgloveSteering(ServerListener):
 
     def _refuse(self, viewer: int, reason: str) -> None:
         """Log a refusal, once for each viewer."""
-        if viewer not in self._refused and len(self._refused) < MAX_CHANNELS:
-            self._refused.add(viewer)
+        if viewer not in self._refused:
+            put_newest(self._refused, viewer, None, MAX_REFUSED)
             log.warning("viewer %d may not steer: %s", viewer, reason)
 
 
