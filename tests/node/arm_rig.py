@@ -29,13 +29,13 @@ CUBE = """<mujoco><worldbody>
   <body name="thing" pos="{x} {y} 0.015"><freejoint/>
     <geom type="box" size=".015 .015 .015" mass=".05" condim="6" friction="1 .02 .0005"/>
   </body></worldbody></mujoco>"""
-THERE, ELSEWHERE = (0.2388, 0.0), (0.1388, 0.15)
+CUBE_PLACE, NEW_PLACE = (0.2388, 0.0), (0.1388, 0.15)
 THINGS = "things: {cube: {box: [0.03, 0.03, 0.03], at: [0.2388, 0.0, 0.015]}}\n"
 IDLE = Intent(behaviour="test", reason="still")
 MAX_TICKS = 4000
 
 
-def waits(job: Future[Any], _patience_s: float) -> bool:
+def wait_for_job(job: Future[Any], _patience_s: float) -> bool:
     job.exception(PATIENCE_S)
     return True
 
@@ -46,7 +46,7 @@ class Rig:
     def __init__(
         self,
         folder: Path,
-        cube: tuple[float, float] = THERE,
+        cube: tuple[float, float] = CUBE_PLACE,
         mjcf: str | None = None,
         body: str = "so101",
         world: Path | None = None,
@@ -59,7 +59,7 @@ class Rig:
                                world or folder / "world.yaml")  # fmt: skip
         text = mjcf or robot_path(body).with_name("model.xml").read_text()
         self._bus: Any = SimpleNamespace(
-            input_log=SimpleNamespace(in_time=waits),
+            input_log=SimpleNamespace(in_time=wait_for_job),
             latest=lambda _topic: SimpleNamespace(current=ArmModel(mjcf=text)),
             transport=SimpleNamespace(watch_readers=self._watch),
             publish=lambda _topic, message: self.plans.append(message),
@@ -67,11 +67,11 @@ class Rig:
         self.start(Saved())
         self.held = ""
         self.seen: tuple[SeenSolid, ...] = ()
-        self.phases: list[str] = []  # in the order in which they began
-        self.plans: list[ArmPlan] = []  # published ones
+        self.phases: list[str] = []  # in the order of their starts
+        self.plans: list[ArmPlan] = []  # those published
 
     def start(self, saved: Saved) -> None:
-        """Start decision."""
+        """Start decision with the tasks in `saved`."""
         self.manipulator = Manipulator(self._bus, "navigate", saved.held)
         self.queue = TaskQueue(lambda _topic: None, lambda _script: None, saved)  # type: ignore[arg-type, return-value]
         self.outcome: StepOutcome | None = None
@@ -81,7 +81,7 @@ class Rig:
         return lambda: None
 
     def restart(self) -> None:
-        """Stop decision, and start it again with its task file."""
+        """Stop decision, and start it again from its saved tasks."""
         self.manipulator.close()
         saved = msgspec.json.decode(msgspec.json.encode(self.queue.saved), type=Saved)
         for _ in range(20):
@@ -93,7 +93,7 @@ class Rig:
         assert self.manipulator._planner
         return self.manipulator._planner
 
-    def give(self, text: str) -> None:
+    def add_mission(self, text: str) -> None:
         self.queue.add_mission(loads(text, "mission"), "mission", "replace", "test")
 
     def tick(self) -> None:
@@ -107,19 +107,19 @@ class Rig:
             self.phases.append(outcome.reason)
         self.arm.step(intent)
 
-    def take_away(self, to: tuple[float, float] = (0.5, 0.5)) -> None:
-        """Move the held thing somewhere else."""
+    def move_cube(self, to: tuple[float, float] = (0.5, 0.5)) -> None:
+        """Move the cube to another place on the floor."""
         simulation = self.arm.simulation
         joint = simulation.model.body("world/thing").jntadr[0]
         at = simulation.model.jnt_qposadr[joint]
         simulation.data.qpos[at : at + 7] = *to, 0.015, 1.0, 0.0, 0.0, 0.0
 
-    def carry_out(self, text: str) -> Task:
+    def run_mission(self, text: str) -> Task:
         """Run a mission, and return its final state and reason."""
-        self.give(text)
-        return self.carry_on()
+        self.add_mission(text)
+        return self.run_until_done()
 
-    def carry_on(self) -> Task:
+    def run_until_done(self) -> Task:
         """Wait for the end of the current task, and return its final state and reason."""
         for _ in range(MAX_TICKS):
             self.tick()

@@ -29,17 +29,17 @@ class Robot(NodeBench):
         await self.ready()
         return self
 
-    def say(self) -> None:
+    def publish_body(self) -> None:
         self.send(BODY, body(boot=self.boot))
 
     def scan(self, *, y: float | None = None) -> LaserScan:
-        """As seen now."""
-        away = 0.004 * self.tick if y is None else y
-        values = self.rooms.ranges(at(3.0, 2.0 + away, 90))
+        """Return the scan at the present pose, or from `y` m north of the start."""
+        north = 0.004 * self.tick if y is None else y
+        values = self.rooms.ranges(at(3.0, 2.0 + north, 90))
         return scan(values, self.tick, boot=self.boot)
 
     def drive(self, scans: int, *, still: bool = False) -> None:
-        """So many scans, five ticks apart."""
+        """Publish `scans` scans, five ticks apart, and a state at each tick."""
         for _ in range(scans):
             for _ in range(5):
                 self.tick += 1
@@ -48,11 +48,11 @@ class Robot(NodeBench):
             self.send(SCAN, self.scan(y=0.0 if still else None))
 
     async def save(self, name: str, *, replace: bool = False) -> MapReply:
-        """Ask perception to save the map, and return its reply. Time advances meanwhile."""
+        """Ask perception to save the map, and return its reply. Fake time advances meanwhile."""
         bus = Bus(self.network.transport(), self.clock, "test")
         request = MapRequest(name=name, replace=replace)
-        patient = bus.ask(MAP_SAVE, request, timeout_s=600.0)  # by the clock below, which runs fast
-        asking = asyncio.ensure_future(patient)
+        answer = bus.ask(MAP_SAVE, request, timeout_s=600.0)  # of the fake clock below
+        asking = asyncio.ensure_future(answer)
         async with asyncio.timeout(30):
             while not asking.done():
                 await self.clock.advance(20_000_000)

@@ -32,7 +32,7 @@ SCAN_TICKS, START_TICKS = 5, 100
 
 
 class MujocoPlant:
-    """A body in MuJoCo, a tick at a time."""
+    """A body in MuJoCo that advances by one tick at a time."""
 
     def __init__(self, name: str, world: World) -> None:
         self.robot = load_robot(name)
@@ -40,8 +40,8 @@ class MujocoPlant:
         options = msgspec.convert(self.robot.sim, MujocoOptions)
         body = sim_body(self.robot, options, Run(folder=robot_path(name).parent))
         self.simulation = Simulation(body, world, 0)
-        self.poses: list[Pose] = []  # one a tick, by the physics
-        self.speeds: list[Velocity] = []  # as commanded
+        self.poses: list[Pose] = []  # the true pose at each tick
+        self.speeds: list[Velocity] = []  # the commanded velocity at each tick
 
     @property
     def tick(self) -> int:
@@ -84,11 +84,11 @@ def _nodes(plant: MujocoPlant, folder: Path) -> dict[str, Node]:
 async def send_to(
     plant: MujocoPlant, goal: tuple[float, float, float], folder: Path, seconds: float
 ) -> TaskStatus:
-    """Send the body to a goal (x, y, yaw) seen from where it starts; return how it ended."""
+    """Send the body to a goal (x, y, yaw) relative to its start; return the last status."""
     async with InMemoryRobot(_nodes(plant, folder)) as robot:
         states = robot.operator.latest(STATE)
-        told: list[TaskStatus] = []
-        robot.operator.subscribe(TASK, lambda _, status: told.append(status))
+        statuses: list[TaskStatus] = []
+        robot.operator.subscribe(TASK, lambda _, status: statuses.append(status))
         while not (states.current and states.current.gate.mode == "enabled") or (
             plant.tick < START_TICKS
         ):
@@ -97,11 +97,11 @@ async def send_to(
         (reply,) = await robot.ask(GOAL, GoalRequest(x=x, y=y, yaw=yaw, source="test"))
         assert reply.ok, reply.text
         begin = plant.tick
-        while not told[-1].done and plant.tick - begin < 50 * seconds:
+        while not statuses[-1].done and plant.tick - begin < 50 * seconds:
             await robot.tick()
-    return told[-1]
+    return statuses[-1]
 
 
-def turned(one: float, other: float) -> float:
-    """The angle between two headings [rad]."""
-    return abs(math.remainder(one - other, math.tau))
+def heading_difference(first: float, second: float) -> float:
+    """Return the angle between two headings [rad]."""
+    return abs(math.remainder(first - second, math.tau))

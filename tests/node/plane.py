@@ -58,7 +58,7 @@ def as_map(cells: Cells, tick: int, boot: int) -> OccupancyGrid:
 
 
 class Plane:
-    """A waffle in a world of cells. Used as `async with Plane(cells) as plane:`."""
+    """A Waffle in a world of cells. Use it as `async with Plane(cells) as plane:`."""
 
     def __init__(
         self,
@@ -70,7 +70,7 @@ class Plane:
         self.bench = NodeBench(functools.partial(decision.run, config))
         self.cells, self.known = cells, cells.copy()
         self.x, self.y, self.yaw = at
-        self.start = at  # pose at the start of the odometry
+        self.start = at  # pose at which the odometry started
         self.velocity, self.tick, self.localized = Velocity(), 0, True
         self.intent = Intent(behaviour="none", reason="")
         self.intents: list[Intent] = []  # one per scan
@@ -78,11 +78,11 @@ class Plane:
         self.gate = DRIVING
         self.travelled = 0.0
         self.closest = math.inf  # [m], from the body's centre to an obstacle
-        self.maps = True  # perception publishes maps
-        self.maps_sent = False  # the newest map was sent
+        self.maps = True  # whether perception publishes maps
+        self.maps_sent = False  # whether the newest map was sent
         self.boot, self.description = BOOT, WAFFLE
-        self.late_ticks = 0  # transit time of world models and poses
-        self._on_the_way: list[tuple[int, WorldModel, PoseInMap]] = []
+        self.late_ticks = 0  # transit time of world models and poses [ticks]
+        self._in_transit: list[tuple[int, WorldModel, PoseInMap]] = []
 
     async def __aenter__(self) -> Self:
         await self.bench.__aenter__()
@@ -102,12 +102,12 @@ class Plane:
         await self.bench.__aexit__(kind, error, traceback)
 
     async def go(self, seconds: float) -> None:
-        """Let some seconds pass."""
+        """Let `seconds` of fake time pass."""
         for _ in range(round(seconds * 50)):
             await self._tick()
 
     async def until(self, *states: str, seconds: float) -> None:
-        """Let time pass until a task ends, in one of `states`."""
+        """Let time pass until a task ends; assert that it ends in one of `states`."""
         for _ in range(round(seconds * 50)):
             await self._tick()
             if not self.status.current and self.status.done:
@@ -127,13 +127,13 @@ class Plane:
         """Send a request while time stands still, and return the reply."""
         return (await self.operator.ask(service, request, timeout_s=30.0))[0]
 
-    def driver_starts_anew(self) -> None:
-        """Restart ticks and odometry; the map and the pose in it stay. No new map is sent."""
+    def restart_driver(self) -> None:
+        """Restart ticks and odometry. The map and the pose in it stay; no new map is sent."""
         self.boot, self.tick, self.start = self.boot + 1, 1, (self.x, self.y, self.yaw)
         self.velocity, self.maps_sent = Velocity(), True
 
     async def restart(self) -> None:
-        """Restart the node."""
+        """Restart the decision node."""
         await self.bench.restart()
         await self.bench.ready()
 
@@ -152,9 +152,9 @@ class Plane:
                          pose=(x, y, yaw), gate=self.gate, boot=self.boot),
         )  # fmt: skip
         if self.tick % 5 == 0:
-            self._on_the_way.append((self.tick + self.late_ticks, self._world(), self._place()))
-        while self._on_the_way and self._on_the_way[0][0] <= self.tick:
-            _, world, place = self._on_the_way.pop(0)
+            self._in_transit.append((self.tick + self.late_ticks, self._world(), self._place()))
+        while self._in_transit and self._in_transit[0][0] <= self.tick:
+            _, world, place = self._in_transit.pop(0)
             bench.send(WORLD, world)
             if self.maps:
                 bench.send(POSE, place)
@@ -198,21 +198,21 @@ class Plane:
         rows = ((self.y + np.outer(np.sin(angles), reach)) / CELL).astype(int)
         height, width = self.cells.shape
         inside = (rows >= 0) & (columns >= 0) & (rows < height) & (columns < width)
-        there = np.zeros(rows.shape, bool)
-        there[inside] = self.cells[rows[inside], columns[inside]] == 100
-        self._see(rows, columns, inside, there)
-        first = there.argmax(axis=1)
-        return np.where(there.any(axis=1), reach[first], np.inf)
+        occupied = np.zeros(rows.shape, bool)
+        occupied[inside] = self.cells[rows[inside], columns[inside]] == 100
+        self._see(rows, columns, inside, occupied)
+        first = occupied.argmax(axis=1)
+        return np.where(occupied.any(axis=1), reach[first], np.inf)
 
     def _see(
         self,
         rows: NDArray[np.int64],
         columns: NDArray[np.int64],
         inside: NDArray[np.bool_],
-        there: NDArray[np.bool_],
+        occupied: NDArray[np.bool_],
     ) -> None:
         """Mark the cells that the beams passed or hit as known."""
-        passed = inside & (np.cumsum(there, axis=1) - there == 0)
+        passed = inside & (np.cumsum(occupied, axis=1) - occupied == 0)
         r, c = rows[passed], columns[passed]
         self.known[r, c] = self.cells[r, c]
 

@@ -11,7 +11,7 @@ from gigabrain_schemas.brain import Intent, JointTarget
 from gigabrain_schemas.safety import JointCap
 from gigabrain_zenoh.decision.manipulator import HOLD_UPS
 from gigabrain_zenoh.decision.tasks.mission_files import loads
-from tests.node.arm_rig import ELSEWHERE, THERE, THINGS, Rig
+from tests.node.arm_rig import CUBE_PLACE, NEW_PLACE, THINGS, Rig
 
 PLACE = THINGS + "do: [{pick: cube}, {place: [0.1388, 0.15, 0.015]}]"
 PRESS = THINGS + "do: [{press: cube}]"
@@ -24,7 +24,7 @@ def rig(tmp_path: Path) -> Iterator[Rig]:
     made.manipulator.close()
 
 
-def until(rig: Rig, phase: str) -> None:
+def run_until_phase(rig: Rig, phase: str) -> None:
     while rig.phases[-1:] != [phase]:
         rig.tick()
         assert rig.queue.status.current, rig.queue.status.done
@@ -37,148 +37,148 @@ def pause(rig: Rig) -> None:
     rig.queue.resume("")
 
 
-def preempt(rig: Rig, text: str) -> None:
+def run_preempting_mission(rig: Rig, text: str) -> None:
     rig.queue.add_mission(loads(text, "mission"), "mission", "preempt", "bob")
     while not rig.queue.status.done:
         rig.tick()
     assert rig.queue.status.done[0].state == "succeeded"
 
 
-@pytest.mark.parametrize("other", ["", "do: [{posture: home}]"])
-def test_a_thing_put_down_stays_there_when_the_step_continues(rig: Rig, other: str) -> None:
-    rig.give(PLACE)
-    until(rig, "retreat")
+@pytest.mark.parametrize("other_mission", ["", "do: [{posture: home}]"])
+def test_a_put_down_thing_stays_there_when_the_step_continues(rig: Rig, other_mission: str) -> None:
+    rig.add_mission(PLACE)
+    run_until_phase(rig, "retreat")
     rig.tick()
     things = rig.queue.saved.jobs[0].things
     assert things
-    assert things["cube"].at == pytest.approx((*ELSEWHERE, 0.015), abs=0.01)
-    preempt(rig, other) if other else pause(rig)
-    task = rig.carry_on()
+    assert things["cube"].at == pytest.approx((*NEW_PLACE, 0.015), abs=0.01)
+    run_preempting_mission(rig, other_mission) if other_mission else pause(rig)
+    task = rig.run_until_done()
     assert (task.id, task.state, task.reason) == ("mission-1", "succeeded", "")
-    assert rig.arm.thing()[:2] == pytest.approx(ELSEWHERE, abs=0.012)
+    assert rig.arm.thing()[:2] == pytest.approx(NEW_PLACE, abs=0.012)
 
 
-@pytest.mark.parametrize("other", ["", "do: [{posture: home}]"])
-def test_a_press_is_not_repeated_when_the_step_continues(rig: Rig, other: str) -> None:
-    rig.give(PRESS)
-    until(rig, "retreat")
-    preempt(rig, other) if other else pause(rig)
-    task = rig.carry_on()
+@pytest.mark.parametrize("other_mission", ["", "do: [{posture: home}]"])
+def test_a_press_is_not_repeated_when_the_step_continues(rig: Rig, other_mission: str) -> None:
+    rig.add_mission(PRESS)
+    run_until_phase(rig, "retreat")
+    run_preempting_mission(rig, other_mission) if other_mission else pause(rig)
+    task = rig.run_until_done()
     assert (task.id, task.state) == ("mission-1", "succeeded")
     assert task.reason.startswith("pressed with ")
     assert rig.phases.count("press") == 1
 
 
-def test_a_pause_in_the_tick_in_which_a_step_is_done_keeps_its_result(rig: Rig) -> None:
-    rig.give(PLACE)
-    until(rig, "retreat")
+def test_a_pause_in_the_last_tick_of_a_step_keeps_its_result(rig: Rig) -> None:
+    rig.add_mission(PLACE)
+    run_until_phase(rig, "retreat")
     while rig.outcome is None or rig.outcome.state == "running":
         rig.tick()
     pause(rig)
-    assert rig.carry_on().state == "succeeded"
+    assert rig.run_until_done().state == "succeeded"
 
 
 @pytest.mark.parametrize("cancelled", [False, True])
 @pytest.mark.parametrize("phase", ["descend", "close", "press"])
-def test_another_task_backs_off_from_the_thing_at_the_hand(
+def test_the_next_task_backs_off_from_the_thing_at_the_gripper(
     rig: Rig, phase: str, cancelled: bool
 ) -> None:
-    rig.give(PRESS if phase == "press" else PLACE)
-    until(rig, phase)
+    rig.add_mission(PRESS if phase == "press" else PLACE)
+    run_until_phase(rig, phase)
     for _ in range(20):
         rig.tick()
     if cancelled:
         rig.queue.cancel("", "ann")
         rig.tick()
     rig.phases = []
-    task = rig.carry_out("do: [{posture: {shoulder_pan: 1.0}}]")
+    task = rig.run_mission("do: [{posture: {shoulder_pan: 1.0}}]")
     assert (task.state, task.reason) == ("succeeded", "")
     assert rig.phases.index("retreat") < rig.phases.index("move")
-    assert rig.arm.thing()[:2] == pytest.approx(THERE, abs=0.01)
+    assert rig.arm.thing()[:2] == pytest.approx(CUBE_PLACE, abs=0.01)
 
 
-def test_another_task_backs_off_from_the_thing_put_down(rig: Rig) -> None:
-    rig.give(PLACE)
-    until(rig, "retreat")
+def test_the_next_task_backs_off_from_the_put_down_thing(rig: Rig) -> None:
+    rig.add_mission(PLACE)
+    run_until_phase(rig, "retreat")
     rig.tick()
     rig.phases = []
-    rig.carry_out("do: [{posture: {shoulder_pan: -0.5}}]")
-    assert rig.arm.thing()[:2] == pytest.approx(ELSEWHERE, abs=0.012)
+    rig.run_mission("do: [{posture: {shoulder_pan: -0.5}}]")
+    assert rig.arm.thing()[:2] == pytest.approx(NEW_PLACE, abs=0.012)
     assert rig.phases.index("retreat") < rig.phases.index("move")
 
 
 @pytest.mark.parametrize("cancelled", [False, True])
-def test_another_task_backs_off_from_the_thing_being_let_go(rig: Rig, cancelled: bool) -> None:
-    rig.give(PLACE)
-    until(rig, "lift")
-    pause(rig)  # at the target of the held thing
-    until(rig, "traverse")
-    until(rig, "open")
+def test_the_next_task_backs_off_from_the_thing_being_released(rig: Rig, cancelled: bool) -> None:
+    rig.add_mission(PLACE)
+    run_until_phase(rig, "lift")
+    pause(rig)  # where the held thing was to go
+    run_until_phase(rig, "traverse")
+    run_until_phase(rig, "open")
     for _ in range(15):
         rig.tick()
     if cancelled:
         rig.queue.cancel("", "ann")
         rig.tick()
     rig.phases = []
-    assert rig.carry_out("do: [{posture: {shoulder_pan: -0.5}}]").state == "succeeded"
-    assert rig.arm.thing()[:2] == pytest.approx(ELSEWHERE, abs=0.012)
+    assert rig.run_mission("do: [{posture: {shoulder_pan: -0.5}}]").state == "succeeded"
+    assert rig.arm.thing()[:2] == pytest.approx(NEW_PLACE, abs=0.012)
     assert rig.phases.index("retreat") < rig.phases.index("move")
 
 
 @pytest.mark.parametrize("ticks", [1, 15, 30])
-@pytest.mark.parametrize("other", ["", "do: [{posture: home}]"])
-def test_a_thing_is_put_down_whenever_letting_go_is_interrupted(
-    rig: Rig, other: str, ticks: int
+@pytest.mark.parametrize("other_mission", ["", "do: [{posture: home}]"])
+def test_a_thing_is_put_down_even_if_its_release_is_interrupted(
+    rig: Rig, other_mission: str, ticks: int
 ) -> None:
-    rig.give(PLACE)
-    until(rig, "traverse")
-    until(rig, "open")
+    rig.add_mission(PLACE)
+    run_until_phase(rig, "traverse")
+    run_until_phase(rig, "open")
     for _ in range(ticks):
         rig.tick()
-    preempt(rig, other) if other else pause(rig)
-    task = rig.carry_on()
+    run_preempting_mission(rig, other_mission) if other_mission else pause(rig)
+    task = rig.run_until_done()
     assert (task.state, task.reason) == ("succeeded", "")
-    assert rig.arm.thing()[:2] == pytest.approx(ELSEWHERE, abs=0.012)
+    assert rig.arm.thing()[:2] == pytest.approx(NEW_PLACE, abs=0.012)
 
 
-def test_after_a_failure_at_a_thing_the_next_command_backs_off(rig: Rig) -> None:
-    rig.give(PLACE)
-    until(rig, "descend")
+def test_after_a_failure_near_a_thing_the_next_command_backs_off(rig: Rig) -> None:
+    rig.add_mission(PLACE)
+    run_until_phase(rig, "descend")
     rig.manipulator._hold_ups = HOLD_UPS
     rig.arm.caps = tuple(JointCap(name=name, rise=0.0, fall=0.0) for name in rig.planner.arm.names)
-    assert rig.carry_on().state == "failed"
+    assert rig.run_until_done().state == "failed"
     rig.arm.caps, rig.phases = (), []
-    assert rig.carry_out("do: [{posture: {shoulder_pan: 1.0}}]").state == "succeeded"
+    assert rig.run_mission("do: [{posture: {shoulder_pan: 1.0}}]").state == "succeeded"
     assert rig.phases.index("retreat") < rig.phases.index("move")
 
 
 def test_an_interrupted_retreat_continues(rig: Rig) -> None:
-    rig.give(PLACE)
-    until(rig, "lift")
-    rig.take_away()
-    until(rig, "retreat")
+    rig.add_mission(PLACE)
+    run_until_phase(rig, "lift")
+    rig.move_cube()
+    run_until_phase(rig, "retreat")
     rig.tick()
     pause(rig)
     rig.phases = []
-    until(rig, "retreat")
+    run_until_phase(rig, "retreat")
     assert "move" not in rig.phases
 
 
 def test_an_arm_does_not_back_off_after_its_base_moved(rig: Rig) -> None:
-    rig.give(PLACE)
-    until(rig, "descend")
+    rig.add_mission(PLACE)
+    run_until_phase(rig, "descend")
     rig.queue.cancel("", "ann")
     rig.tick()
     before, rig.phases = rig.arm.state, []
     rig.arm.state = lambda: replace(before(), pose=Pose(x=0.1, y=0.0, yaw=0.0))  # type: ignore[method-assign]
-    assert rig.carry_out("do: [{posture: {shoulder_pan: 1.0}}]").state == "succeeded"
+    assert rig.run_mission("do: [{posture: {shoulder_pan: 1.0}}]").state == "succeeded"
     assert "retreat" not in rig.phases
 
 
 @pytest.mark.parametrize("paused", [False, True])
 def test_an_arm_does_not_back_off_after_an_operator_moved_it_away(rig: Rig, paused: bool) -> None:
-    rig.give(PLACE)
-    until(rig, "descend")
+    rig.add_mission(PLACE)
+    run_until_phase(rig, "descend")
     rig.queue.pause("", "ann") if paused else rig.queue.cancel("", "ann")
     rig.tick()
     away = tuple(JointTarget(name=name, position=0.3) for name in rig.planner.arm.names)
@@ -187,17 +187,17 @@ def test_an_arm_does_not_back_off_after_an_operator_moved_it_away(rig: Rig, paus
     rig.phases = []
     if paused:
         rig.queue.resume("")
-        assert rig.carry_on().state == "succeeded"
+        assert rig.run_until_done().state == "succeeded"
         assert rig.phases.index("descend") < rig.phases.index("retreat")
     else:
-        assert rig.carry_out("do: [{posture: {shoulder_pan: 1.0}}]").state == "succeeded"
+        assert rig.run_mission("do: [{posture: {shoulder_pan: 1.0}}]").state == "succeeded"
         assert "retreat" not in rig.phases
 
 
-def test_a_thing_that_an_operator_moves_is_not_recorded_at_the_planned_place(rig: Rig) -> None:
-    rig.give(PLACE)
-    until(rig, "traverse")
-    until(rig, "open")
+def test_a_thing_moved_by_an_operator_is_not_recorded_at_its_planned_place(rig: Rig) -> None:
+    rig.add_mission(PLACE)
+    run_until_phase(rig, "traverse")
+    run_until_phase(rig, "open")
     rig.tick()
     rig.queue.pause("", "ann")
     rig.tick()
@@ -211,5 +211,5 @@ def test_a_thing_that_an_operator_moves_is_not_recorded_at_the_planned_place(rig
         for _ in range(200):
             rig.arm.step(Intent(joints=joints, behaviour="test", reason="jog"))
     rig.queue.resume("")
-    assert rig.carry_on().state == "failed"
+    assert rig.run_until_done().state == "failed"
     assert recorded == []

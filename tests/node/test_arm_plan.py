@@ -1,4 +1,4 @@
-"""Arm plans for viewers: the tool's path and its grasps. Without a viewer none is made."""
+"""Arm plans for viewers: the tool's path and its grasps. They are made for viewers only."""
 
 from pathlib import Path
 from typing import Any
@@ -17,9 +17,9 @@ def rig(tmp_path: Path) -> Any:
     made.manipulator.close()
 
 
-def test_the_way_of_the_tool_ends_where_the_tool_gets_to(rig: Rig) -> None:
+def test_the_path_of_the_tool_ends_at_the_goal(rig: Rig) -> None:
     rig.watch_plans(True)
-    assert rig.carry_out("do: [{reach: [0.22, 0.05, 0.12]}]").state == "succeeded"
+    assert rig.run_mission("do: [{reach: [0.22, 0.05, 0.12]}]").state == "succeeded"
     rig.tick()
     plan, over = rig.plans
     assert over == ArmPlan()
@@ -29,10 +29,10 @@ def test_the_way_of_the_tool_ends_where_the_tool_gets_to(rig: Rig) -> None:
 
 
 def test_a_pick_shows_its_grasps_with_the_chosen_one_first(rig: Rig) -> None:
-    rig.give(THINGS + "do: [{pick: cube}]")
+    rig.add_mission(THINGS + "do: [{pick: cube}]")
     while rig.outcome is None or rig.outcome.reason != "hover":
         rig.tick()
-    assert rig.plans == []  # nobody looks
+    assert rig.plans == []  # there is no viewer
     rig.watch_plans(True)
     rig.tick()
     (plan,) = rig.plans
@@ -42,5 +42,5 @@ def test_a_pick_shows_its_grasps_with_the_chosen_one_first(rig: Rig) -> None:
     assert chosen.opening == pytest.approx(0.03)
     assert np.linalg.norm(plan.points() - chosen.position, axis=1).min() < 0.03
     rig.watch_plans(False)
-    rig.carry_on()
+    rig.run_until_done()
     assert len(rig.plans) == 1

@@ -1,4 +1,4 @@
-"""An arm in MuJoCo, behind the gate: nothing moves it but the commander, and it is held."""
+"""An arm in MuJoCo: it goes to its targets, holds still, and falls only when limp."""
 
 from collections.abc import AsyncIterator, Awaitable, Callable
 from pathlib import Path
@@ -22,15 +22,15 @@ from gigabrain_zenoh.qa.bench.hands import with_backlash
 HOME = (0.0, -1.7, 1.4, 0.6, 0.0, 0.0)
 NAMES = ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll", "gripper")
 OUTSTRETCHED = (-0.8, 0.4, -0.8, -0.5, 0.0, 0.0)
-SAG = 0.03  # [rad], of a servo that is held by its gain alone
+MAX_SAG_RAD = 0.03  # [rad], of a servo without integral gain
 
 
-def make() -> Driver:
+def make_so101() -> Driver:
     _, driver = catalog.make_driver("so101", Run(folder=Path(), world="arena", speed=50.0))
     return driver
 
 
-async def run(
+async def run_ticks(
     driver: Driver, ticks: AsyncIterator[int], count: int, act: Callable[[], Awaitable[object]]
 ) -> RobotState:
     for _ in range(count):
@@ -39,8 +39,8 @@ async def run(
     return await driver.read_state()
 
 
-async def test_it_stands_in_its_home_posture_and_goes_where_it_is_sent() -> None:
-    driver = make()
+async def test_it_starts_in_its_home_posture_and_reaches_its_targets() -> None:
+    driver = make_so101()
     goal = dict(zip(NAMES, (0.5, -0.5, 0.6, 0.4, 1.0, 0.8), strict=True))
 
     async def aim() -> None:
@@ -48,12 +48,14 @@ async def test_it_stands_in_its_home_posture_and_goes_where_it_is_sent() -> None
 
     async with driver:
         ticks = driver.ticks(Clock())
-        state = await run(driver, ticks, 50, driver.stop)
+        state = await run_ticks(driver, ticks, 50, driver.stop)
         assert tuple(joint.name for joint in state.joints) == NAMES
-        assert [j.position for j in state.joints] == pytest.approx(HOME, abs=SAG)
-        state = await run(driver, ticks, 100, aim)
-        assert [j.position for j in state.joints] == pytest.approx(list(goal.values()), abs=SAG)
-        held = await run(driver, ticks, 50, driver.hold)
+        assert [j.position for j in state.joints] == pytest.approx(HOME, abs=MAX_SAG_RAD)
+        state = await run_ticks(driver, ticks, 100, aim)
+        assert [j.position for j in state.joints] == pytest.approx(
+            list(goal.values()), abs=MAX_SAG_RAD
+        )
+        held = await run_ticks(driver, ticks, 50, driver.hold)
         assert [j.position for j in held.joints] == pytest.approx(
             [j.position for j in state.joints], abs=0.01
         )
@@ -63,28 +65,28 @@ async def test_it_stands_in_its_home_posture_and_goes_where_it_is_sent() -> None
     assert driver.report()["falls"] == 0
 
 
-async def test_a_limp_arm_falls_and_holds_again_where_it_is_sent() -> None:
-    driver = make()
+async def test_a_limp_arm_falls_until_it_gets_new_targets() -> None:
+    driver = make_so101()
 
     async def nothing() -> None: ...
 
     async with driver:
         ticks = driver.ticks(Clock())
         stretched = dict(zip(NAMES, (0.0, 0.0, 0.0, 0.0, 0.0, 0.0), strict=True))
-        await run(driver, ticks, 100, lambda: driver.set_joint_positions(stretched))
+        await run_ticks(driver, ticks, 100, lambda: driver.set_joint_positions(stretched))
         await driver.limp()
-        state = await run(driver, ticks, 100, nothing)
+        state = await run_ticks(driver, ticks, 100, nothing)
         assert state.limp
         assert state.joints[2].position > 0.2
         where = {joint.name: joint.position for joint in state.joints}
-        state = await run(driver, ticks, 20, lambda: driver.set_joint_positions(where))
+        state = await run_ticks(driver, ticks, 20, lambda: driver.set_joint_positions(where))
         assert not state.limp
-        assert state.joints[2].position == pytest.approx(where["elbow_flex"], abs=SAG)
+        assert state.joints[2].position == pytest.approx(where["elbow_flex"], abs=MAX_SAG_RAD)
         await ticks.aclose()  # type: ignore[attr-defined]
 
 
 def test_the_brain_gets_its_model_as_text() -> None:
-    model = make().arm_model()
+    model = make_so101().arm_model()
     assert model
     assert "<mujoco" in model.mjcf
 
@@ -97,9 +99,7 @@ def simulation_of(body: str, backlash: float = 0.0) -> Simulation:
 
 
 @pytest.mark.slow
-def test_an_outstretched_piper_holds_its_payload_for_ever_and_warms_no_motor_beyond_its_limit() -> (
-    None
-):
+def test_an_outstretched_piper_holds_its_payload_without_overheating() -> None:
     simulation, limit = simulation_of("piper"), catalog.load_robot("piper").thresholds.motor_stop
     assert simulation.arm
     hand = simulation.model.body("robot/link6").id
@@ -114,7 +114,7 @@ def test_an_outstretched_piper_holds_its_payload_for_ever_and_warms_no_motor_bey
     assert 40.0 < max(motor.temperature for motor in simulation.arm.motors()) < limit
 
 
-def test_a_servo_that_is_smoothed_goes_to_a_new_goal_without_a_blow() -> None:
+def test_a_smoothed_servo_follows_a_moving_target_without_torque_peaks() -> None:
     simulation = simulation_of("piper")
     assert simulation.arm
     data, joint = simulation.data, simulation.model.actuator("robot/joint1").id
@@ -127,22 +127,22 @@ def test_a_servo_that_is_smoothed_goes_to_a_new_goal_without_a_blow() -> None:
             efforts.append(abs(data.actuator_force[joint]))
             speeds.append(data.joint("robot/joint1").qvel[0])
     assert np.mean(speeds[250:]) == pytest.approx(1.0, rel=0.05)
-    assert max(efforts[250:]) < 25.0  # of 40 N m
+    assert max(efforts[250:]) < 25.0  # [N m], of at most 40
 
 
-OUT = {
+OUTSTRETCHED_JOINTS = {
     "so101": {"shoulder_lift": 0.3, "elbow_flex": -0.3, "wrist_flex": 0.0},
     "piper": {"joint2": 1.6, "joint3": -1.3},
 }
 
 
-@pytest.mark.parametrize("body", OUT)
-def test_a_joint_with_backlash_is_free_within_it_and_gravity_takes_it_to_its_end(body: str) -> None:
+@pytest.mark.parametrize("body", OUTSTRETCHED_JOINTS)
+def test_a_joint_moves_freely_within_its_backlash_and_sags_to_its_end(body: str) -> None:
     rests = {}
     for play in (0.0, 0.04):
         simulation = simulation_of(body, play)
         assert simulation.arm
-        simulation.arm.aim(OUT[body])
+        simulation.arm.aim(OUTSTRETCHED_JOINTS[body])
         for _ in range(300):
             simulation.advance()
         rests[play] = [motor.position for motor in simulation.arm.motors()]
@@ -157,7 +157,7 @@ def test_a_joint_with_backlash_is_free_within_it_and_gravity_takes_it_to_its_end
     assert sagged[1:3] == pytest.approx([0.02, 0.02], abs=0.004)
 
 
-def test_servos_of_a_joint_that_is_not_there_are_refused_with_the_line(tmp_path: Path) -> None:
+def test_servos_of_an_unknown_joint_are_refused_with_their_line(tmp_path: Path) -> None:
     path = catalog.robot_path("piper")
     mine = tmp_path / "robot.yaml"
     mine.write_text(path.read_text().replace("joints: [gripper]", "joints: [griper]"))
@@ -167,7 +167,7 @@ def test_servos_of_a_joint_that_is_not_there_are_refused_with_the_line(tmp_path:
 
 
 @pytest.mark.parametrize("name", NAMES[:5])
-async def test_a_joint_at_its_greatest_speed_is_at_rest_120_ms_after_it_is_stopped(
+async def test_a_joint_at_its_maximum_speed_rests_120_ms_after_a_stop(
     name: str,
 ) -> None:
     robot, driver = catalog.make_driver("so101", Run(folder=Path(), world="arena", speed=50.0))
@@ -181,14 +181,14 @@ async def test_a_joint_at_its_greatest_speed_is_at_rest_120_ms_after_it_is_stopp
 
     async with driver:
         ticks = driver.ticks(Clock())
-        await run(driver, ticks, 100, aim)
+        await run_ticks(driver, ticks, 100, aim)
         for _ in range(18):
             sent = accelerated(sent, joint.max_speed, joint, 0.02)
-            state = await run(driver, ticks, 1, aim)
+            state = await run_ticks(driver, ticks, 1, aim)
         assert state.joints[index].velocity > 0.9 * joint.max_speed
         sent = stopped(sent)
-        await run(driver, ticks, 6, aim)
+        await run_ticks(driver, ticks, 6, aim)
         for _ in range(25):
-            state = await run(driver, ticks, 1, aim)
+            state = await run_ticks(driver, ticks, 1, aim)
             assert abs(state.joints[index].velocity) < 0.2
         await ticks.aclose()  # type: ignore[attr-defined]

@@ -1,4 +1,4 @@
-"""The map outlives perception: saved every few seconds, and gone on with by the next process."""
+"""The map outlives perception: it is saved every few seconds, and the next process continues it."""
 
 import asyncio
 import functools
@@ -26,59 +26,59 @@ from gigabrain_zenoh.recording.process_replay import with_requests
 from gigabrain_zenoh.runtime.replay import record, replay
 from gigabrain_zenoh.testing.samples import state
 from tests.node.mapping_robot import Robot
-from tests.node.test_zone_keeping import LAB, ask, newest
+from tests.node.test_zone_keeping import LAB, ask, newest_zones
 
 SCANS_IN_5_S = 50
 Usage = namedtuple("Usage", "total used free")
 
 
-class Walking(Robot):
-    """The robot drives north at 0.2 m/s, unless it is told to stand, which it does where it is."""
+class DrivingRobot(Robot):
+    """A robot that drives north at 0.2 m/s, or stands still where it is."""
 
     def __init__(self, folder: Path | str) -> None:
         super().__init__(PerceptionConfig(mapping="slam", state_dir=str(folder)))
-        self.away = 0.0
+        self.north_m = 0.0
 
     def drive(self, scans: int, *, still: bool = False) -> None:
         for _ in range(scans):
             for _ in range(5):
                 self.tick += 1
-                self.away += 0.0 if still else 0.004
-                self.send(STATE, state(self.tick, pose=(self.away, 0, 0), boot=self.boot))
-            self.send(SCAN, self.scan(y=self.away))
+                self.north_m += 0.0 if still else 0.004
+                self.send(STATE, state(self.tick, pose=(self.north_m, 0, 0), boot=self.boot))
+            self.send(SCAN, self.scan(y=self.north_m))
 
     async def drive_until_saved(self, saves: int = 2) -> None:
-        """On until so many saves are on disk: what a busy machine writes late, it writes later."""
+        """Drive until so many saves are on disk; a busy machine may write them late."""
         async with asyncio.timeout(60):
             while self.report("saves") < saves:
                 self.drive(1)
                 await asyncio.sleep(0.002)
 
-    async def look(self, scans: int = SCANS_IN_5_S) -> list[bool]:
-        """Stand for so many scans; whether it is localized at each."""
+    async def stand(self, scans: int = SCANS_IN_5_S) -> list[bool]:
+        """Stand for `scans` scans; return for each whether the robot is localized."""
         self.sent(POSE)
         for _ in range(scans):
             self.drive(1, still=True)
-            await asyncio.sleep(0.005)  # searches run beside
+            await asyncio.sleep(0.005)  # searches run in a thread
         poses = self.sent(POSE)
-        assert not poses[-1].localized or abs(poses[-1].x - self.away) < 0.06
+        assert not poses[-1].localized or abs(poses[-1].x - self.north_m) < 0.06
         return [pose.localized for pose in poses]
 
-    async def die(self) -> None:
-        """Perception ends and is started again."""
+    async def restart_perception(self) -> None:
+        """End perception and start it again."""
         await self.restart()
         await self.ready()
-        self.say()
+        self.publish_body()
 
     def report(self, name: str) -> float:
         return float(self.bus.report()[name] or 0)
 
     def grid(self) -> OccupancyGrid:
-        """The newest map."""
+        """Return the newest map."""
         return next(map_of(data) for key, data in reversed(self.network.sent) if key == MAP.key)
 
-    def known(self) -> float:
-        """The area of the newest map [m²]."""
+    def known_area(self) -> float:
+        """Return the known area of the newest map [m²]."""
         self.drive(11, still=True)
         grid = self.grid()
         return float(np.count_nonzero(np.frombuffer(grid.cells, np.int8) >= 0)) * 0.0025
@@ -92,125 +92,125 @@ def files(folder: Path) -> list[Path]:
     return sorted(folder.iterdir(), key=lambda path: path.stat().st_mtime_ns)
 
 
-async def test_after_a_death_the_map_is_there_and_the_robot_found_within_5_s(
+async def test_restarted_perception_has_the_map_and_localizes_the_robot_within_5_s(
     tmp_path: Path,
 ) -> None:
-    async with Walking(tmp_path) as robot:
-        robot.say()
+    async with DrivingRobot(tmp_path) as robot:
+        robot.publish_body()
         await robot.drive_until_saved()
-        before = robot.known()
-        await robot.die()
-        assert all(await robot.look())  # from the first scan on
-        assert robot.known() > 0.98 * before
-        before = robot.known()
+        before = robot.known_area()
+        await robot.restart_perception()
+        assert all(await robot.stand())  # from the first scan
+        assert robot.known_area() > 0.98 * before
+        before = robot.known_area()
         robot.drive(20)
-        assert robot.known() > before  # and it grows on
+        assert robot.known_area() > before  # the map continues to grow
 
 
-async def test_a_robot_that_was_driven_on_while_nobody_mapped_is_found(tmp_path: Path) -> None:
-    async with Walking(tmp_path) as robot:
-        robot.say()
+async def test_a_robot_that_moved_while_perception_was_down_is_localized(tmp_path: Path) -> None:
+    async with DrivingRobot(tmp_path) as robot:
+        robot.publish_body()
         await robot.drive_until_saved()
-        robot.away += 0.6
-        await robot.die()
-        assert all(await robot.look())
+        robot.north_m += 0.6
+        await robot.restart_perception()
+        assert all(await robot.stand())
 
 
-def cut(data: bytes) -> bytes:
+def cut_in_half(data: bytes) -> bytes:
     return data[: len(data) // 2]
 
 
-def empty(_: bytes) -> bytes:
+def emptied(_: bytes) -> bytes:
     return b""
 
 
-def flipped(data: bytes) -> bytes:
-    """One bit in each 10 kB."""
+def flip_bits(data: bytes) -> bytes:
+    """Flip one bit in each 10 kB."""
     chance, spoilt = random.Random(1), bytearray(data)
     for _ in range(0, len(data), 10_000):
         spoilt[chance.randrange(len(data))] ^= 1 << chance.randrange(8)
     return bytes(spoilt)
 
 
-@pytest.mark.parametrize("damage", [cut, empty, flipped])
-async def test_a_damaged_save_is_refused_and_the_one_before_it_is_taken(
+@pytest.mark.parametrize("damage", [cut_in_half, emptied, flip_bits])
+async def test_a_damaged_save_is_refused_and_the_previous_one_is_loaded(
     damage: Any, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    async with Walking(tmp_path) as robot:
-        robot.say()
+    async with DrivingRobot(tmp_path) as robot:
+        robot.publish_body()
         await robot.drive_until_saved()
         newest = files(tmp_path)[-1]
         newest.write_bytes(damage(newest.read_bytes()))
-        await robot.die()
-        assert (await robot.look())[-1]
+        await robot.restart_perception()
+        assert (await robot.stand())[-1]
         await robot.drive_until_saved(saves=1)
-    told = [line for line in caplog.messages if line.startswith("a saved map is refused: ")]
-    assert len(told) == 1
-    assert str(newest) in told[0]
-    assert newest == files(tmp_path)[-1]  # and it is replaced first
+    warnings = [line for line in caplog.messages if line.startswith("a saved map is refused: ")]
+    assert len(warnings) == 1
+    assert str(newest) in warnings[0]
+    assert newest == files(tmp_path)[-1]  # the damaged one is replaced first
 
 
-async def test_without_a_whole_save_a_new_map_begins(
+async def test_without_an_intact_save_a_new_map_begins(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    async with Walking(tmp_path) as robot:
-        robot.say()
+    async with DrivingRobot(tmp_path) as robot:
+        robot.publish_body()
         await robot.drive_until_saved()
         for path in files(tmp_path):
-            path.write_bytes(cut(path.read_bytes()))
-        await robot.die()
-        assert (await robot.look(1))[0]
+            path.write_bytes(cut_in_half(path.read_bytes()))
+        await robot.restart_perception()
+        assert (await robot.stand(1))[0]
     assert len([line for line in caplog.messages if "is refused" in line]) == 2
 
 
-async def test_the_map_of_another_start_of_the_driver_is_left_alone(tmp_path: Path) -> None:
-    async with Walking(tmp_path) as robot:
-        robot.say()
+async def test_a_map_from_another_start_of_the_driver_is_not_loaded(tmp_path: Path) -> None:
+    async with DrivingRobot(tmp_path) as robot:
+        robot.publish_body()
         await robot.drive_until_saved()
-        before = robot.known()
-        robot.boot, robot.tick, robot.away = 8, 0, 0.0
-        await robot.die()
-        assert (await robot.look(1))[0]  # nobody looks for it in the old map
-        assert robot.known() < before
+        before = robot.known_area()
+        robot.boot, robot.tick, robot.north_m = 8, 0, 0.0
+        await robot.restart_perception()
+        assert (await robot.stand(1))[0]  # the old map is not searched
+        assert robot.known_area() < before
 
 
-async def test_a_death_after_a_new_start_of_the_driver_loses_nothing_either(
+async def test_a_map_survives_restarts_of_driver_and_perception(
     tmp_path: Path,
 ) -> None:
-    async with Walking(tmp_path) as robot:
-        robot.say()
+    async with DrivingRobot(tmp_path) as robot:
+        robot.publish_body()
         await robot.drive_until_saved()
-        before, saves = robot.known(), robot.report("saves")
+        before, saves = robot.known_area(), robot.report("saves")
         robot.boot, robot.tick = 8, 0
-        robot.say()
-        await robot.look()
-        while robot.report("saves") <= saves + 1:  # the first may be of a lost robot
-            await robot.look(1)
-        await robot.die()
-        assert all(await robot.look())  # from the first scan on
-        assert robot.known() > 0.98 * before
+        robot.publish_body()
+        await robot.stand()
+        while robot.report("saves") <= saves + 1:  # the first save may be of a lost robot
+            await robot.stand(1)
+        await robot.restart_perception()
+        assert all(await robot.stand())  # from the first scan
+        assert robot.known_area() > 0.98 * before
 
 
-async def test_a_robot_that_is_lost_when_perception_dies_is_still_lost(
+async def test_a_lost_robot_is_still_lost_after_a_restart_of_perception(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    async with Walking(tmp_path) as robot:
-        robot.say()
+    async with DrivingRobot(tmp_path) as robot:
+        robot.publish_body()
         await robot.drive_until_saved()
         saves = robot.report("saves")
         with monkeypatch.context() as patch:
             patch.setattr(localizer, "search", lambda *_: [])  # finds nothing yet
             robot.boot, robot.tick = 8, 0
-            robot.say()
+            robot.publish_body()
             while robot.report("saves") <= saves:
-                assert not any(await robot.look(1))
-        await robot.die()
-        looked = await robot.look()
+                assert not any(await robot.stand(1))
+        await robot.restart_perception()
+        looked = await robot.stand()
     assert not looked[0]
     assert looked[-1]
 
 
-def test_a_robot_that_is_lost_or_found_elsewhere_is_saved_as_it_is(tmp_path: Path) -> None:
+def test_a_save_is_made_when_the_robot_gets_lost_or_is_found_elsewhere(tmp_path: Path) -> None:
     saved, saves, tick = autosave.Autosave(tmp_path), [], 0
     for x, lost in ((0.0, False), (0.0, True), (5.0, False), (5.0, False)):
         still: Any = SimpleNamespace(
@@ -224,24 +224,24 @@ def test_a_robot_that_is_lost_or_found_elsewhere_is_saved_as_it_is(tmp_path: Pat
     assert saves == [1, 2, 3, 3]
 
 
-async def test_saving_changes_nothing_that_is_said(tmp_path: Path) -> None:
-    said = []
+async def test_saving_does_not_change_the_published_messages(tmp_path: Path) -> None:
+    published = []
     for folder in ("", tmp_path):
-        async with Walking(folder) as robot:
-            robot.say()
+        async with DrivingRobot(folder) as robot:
+            robot.publish_body()
             for _ in range(100):
                 robot.drive(1)
                 await asyncio.sleep(0)
-            said.append([data for key, data in robot.network.sent if key == POSE.key])
-            said.append([data for key, data in robot.network.sent if key == MAP.key])
-    assert said[0] == said[2]
-    assert said[1] == said[3]
+            published.append([data for key, data in robot.network.sent if key == POSE.key])
+            published.append([data for key, data in robot.network.sent if key == MAP.key])
+    assert published[0] == published[2]
+    assert published[1] == published[3]
 
 
-async def test_a_replay_neither_reads_nor_writes(tmp_path: Path) -> None:
-    async with Walking(tmp_path) as robot:
+async def test_a_replay_neither_loads_nor_saves_maps(tmp_path: Path) -> None:
+    async with DrivingRobot(tmp_path) as robot:
         events = record(robot.network, robot.clock)
-        robot.say()
+        robot.publish_body()
         robot.drive(60)
     then = [(key, data) for _, key, data in events if key in (WORLD.key, POSE.key)]
     before = [path.read_bytes() for path in files(tmp_path)]
@@ -255,30 +255,30 @@ async def test_a_replay_neither_reads_nor_writes(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-async def test_a_robot_that_stands_writes_no_more(tmp_path: Path) -> None:
-    async with Walking(tmp_path) as robot:
-        robot.say()
+async def test_a_standing_robot_saves_no_more_maps(tmp_path: Path) -> None:
+    async with DrivingRobot(tmp_path) as robot:
+        robot.publish_body()
         await robot.drive_until_saved()
-        await robot.look(100)
+        await robot.stand(100)
         saves = robot.report("saves")
-        await robot.look(200)
+        await robot.stand(200)
         assert robot.report("saves") == saves
 
 
-async def test_two_maps_and_the_zones_are_all_that_the_disk_holds(tmp_path: Path) -> None:
-    async with Walking(tmp_path / "state") as robot:
-        robot.say()
+async def test_only_two_maps_and_the_zones_are_on_disk(tmp_path: Path) -> None:
+    async with DrivingRobot(tmp_path / "state") as robot:
+        robot.publish_body()
         await robot.drive_until_saved(saves=4)
-        await robot.look(50)
+        await robot.stand(50)
     names = {path.name for path in (tmp_path / "state").iterdir()}
     assert names == {"map_0.npz", "map_1.npz", "zones.json"}
 
 
-async def test_a_disk_that_fills_up_is_reported_once_and_mapping_goes_on(
+async def test_a_full_disk_is_reported_once_and_mapping_goes_on(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    async with Walking(tmp_path) as robot:
-        robot.say()
+    async with DrivingRobot(tmp_path) as robot:
+        robot.publish_body()
         await robot.drive_until_saved(saves=1)
         full = Usage(10**9, 10**9, 10**8)
         monkeypatch.setattr(autosave.shutil, "disk_usage", lambda _: full)
@@ -292,11 +292,13 @@ async def test_a_disk_that_fills_up_is_reported_once_and_mapping_goes_on(
         assert robot.bus.problems == ()
     assert [problem.code for problem in problems] == ["map_unsaved"]
     assert f"{tmp_path}/map_1.npz: less than 20" in problems[0].text
-    told = [r for r in caplog.records if r.levelno == logging.WARNING and "not saved" in r.message]
-    assert len(told) == 1
+    warnings = [
+        r for r in caplog.records if r.levelno == logging.WARNING and "not saved" in r.message
+    ]
+    assert len(warnings) == 1
 
 
-async def test_a_disk_that_hangs_is_reported_after_30_s_and_holds_nobody_up(
+async def test_a_hanging_disk_is_reported_after_30_s_and_delays_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     hangs, real = threading.Event(), autosave.make_folder
@@ -306,8 +308,8 @@ async def test_a_disk_that_hangs_is_reported_after_30_s_and_holds_nobody_up(
         real(folder)
 
     monkeypatch.setattr(autosave, "make_folder", hang)
-    async with Walking(tmp_path) as robot:
-        robot.say()
+    async with DrivingRobot(tmp_path) as robot:
+        robot.publish_body()
         robot.drive(320, still=True)
         problems = robot.bus.problems
         hangs.set()
@@ -318,14 +320,14 @@ async def test_a_disk_that_hangs_is_reported_after_30_s_and_holds_nobody_up(
     assert "map_0.npz: the disk does not take it" in problems[0].text
 
 
-async def test_a_map_is_loaded_to_grow_on_where_the_state_cannot_be_written(
+async def test_a_map_can_be_loaded_and_extended_without_a_state_folder(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
     no_folder = tmp_path / "file"
     no_folder.touch()
-    async with Walking(no_folder) as robot:
-        robot.say()
+    async with DrivingRobot(no_folder) as robot:
+        robot.publish_body()
         robot.drive(40)
         assert (await robot.save("house")).ok
         reply = await ask(robot, MAP_LOAD, MapLoadRequest(name="house", mapping="slam"))
@@ -336,7 +338,7 @@ async def test_a_map_is_loaded_to_grow_on_where_the_state_cannot_be_written(
     assert told[0].endswith(f"{no_folder}/map_0.npz: Not a directory")
 
 
-async def test_a_disk_that_takes_no_save_at_all_is_tried_every_4_s_only(
+async def test_a_read_only_disk_is_tried_only_every_4_s(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     tries = []
@@ -346,10 +348,10 @@ async def test_a_disk_that_takes_no_save_at_all_is_tried_every_4_s_only(
         raise OSError(30, "Read-only file system")
 
     monkeypatch.setattr(autosave, "make_folder", refuse)
-    async with Walking(tmp_path) as robot:
-        robot.say()
+    async with DrivingRobot(tmp_path) as robot:
+        robot.publish_body()
         async with asyncio.timeout(60):
-            while not robot.bus.problems:  # which are told once a second
+            while not robot.bus.problems:  # they are published once a second
                 robot.drive(1)
                 await asyncio.sleep(0.002)
         for _ in range(20):
@@ -359,18 +361,18 @@ async def test_a_disk_that_takes_no_save_at_all_is_tried_every_4_s_only(
 
 
 @pytest.mark.parametrize("loaded", [False, True])
-async def test_zones_outlive_perception_where_the_growing_map_cannot_be_saved(
+async def test_zones_outlive_perception_although_the_map_cannot_be_saved(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, loaded: bool
 ) -> None:
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
     async with Robot() as robot:
-        robot.say()
+        robot.publish_body()
         robot.drive(40)
         assert (await robot.save("house")).ok
     monkeypatch.setattr(autosave, "KEEP_FREE_BYTES", 10**18)
     config = PerceptionConfig(mapping="slam", state_dir=str(tmp_path / "robot"))
     async with Robot(config if loaded else replace(config, map="house")) as robot:
-        robot.say()
+        robot.publish_body()
         robot.drive(3, still=True)
         if loaded:
             assert (await ask(robot, MAP_LOAD, MapLoadRequest(name="house", mapping="slam"))).ok
@@ -378,8 +380,8 @@ async def test_zones_outlive_perception_where_the_growing_map_cannot_be_saved(
         for _ in range(2):
             await robot.restart()
             await robot.ready()
-            robot.say()
+            robot.publish_body()
             robot.drive(3, still=True)
-            now = await newest(robot)
+            now = await newest_zones(robot)
             assert ([one.name for one in now.zones], now.map) == (["lab"], "house")
             assert now.maps_loaded == loaded

@@ -25,17 +25,17 @@ from gigabrain_zenoh.qa.bench.barn_course import (
 )
 from gigabrain_zenoh.qa.bench.jackal import MujocoJackal
 
-NONE = np.empty((0, 3))
-QUICK = 128  # plans per cycle
+NO_POSTS = np.empty((0, 3))
+SAMPLES = 128  # plans per cycle, few for a quick test
 
 
-def field(posts: np.ndarray) -> BarnWorld:
+def world_of(posts: np.ndarray) -> BarnWorld:
     return BarnWorld(7, posts, (), (0.0, 0.0, 0.0), (4.0, 0.0), 4.0)
 
 
-def test_the_hard_plant_answers_after_its_delay_and_then_with_its_lag() -> None:
-    calm = Conditions(slip=1.0, drift=0.0)
-    plant, speeds = KinematicJackal(calm, (0.0, 0.0, 0.0), 1), []
+def test_the_hard_plant_follows_commands_after_its_delay_and_lag() -> None:
+    no_drift = Conditions(slip=1.0, drift=0.0)
+    plant, speeds = KinematicJackal(no_drift, (0.0, 0.0, 0.0), 1), []
     for _ in range(13):
         plant.tick(Velocity(linear_x=0.6))
         speeds.append(plant.v)
@@ -44,7 +44,7 @@ def test_the_hard_plant_answers_after_its_delay_and_then_with_its_lag() -> None:
     assert speeds[12] == pytest.approx(0.6 * (1 - math.exp(-0.16 / 0.15)))
 
 
-def test_the_floor_lets_through_part_of_a_turn_and_the_odometry_drifts() -> None:
+def test_slip_reduces_a_turn_and_the_odometry_drifts() -> None:
     plant = KinematicJackal(HARD, (0.0, 0.0, 0.0), 5)
     for _ in range(200):
         plant.tick(Velocity(linear_x=0.5, angular_z=0.3))
@@ -60,10 +60,10 @@ def test_clearance_is_exact() -> None:
     corner = math.hypot(0.4 - 0.208, 0.4 - 0.229) - 0.1
     assert plant.clearance(np.array([(0.4, 0.4, 0.1)])) == pytest.approx(corner)
     assert plant.clearance(np.array([(0.1, 0.1, 0.05)])) < 0.0
-    assert plant.clearance(NONE) == math.inf
+    assert plant.clearance(NO_POSTS) == math.inf
 
 
-def test_a_beam_ends_at_the_first_disc_in_its_way() -> None:
+def test_a_beam_ends_at_the_first_disc() -> None:
     still = Conditions(noise=0.0, dropouts=0.0)
     plant = KinematicJackal(still, (0.0, 0.0, 0.0), 1)
     seen = plant.scan(LIDAR, np.array([(2.055, 0.0, 0.5), (4.0, 0.0, 0.5), (0.055, 3.0, 0.1)]))
@@ -75,75 +75,75 @@ def test_a_beam_ends_at_the_first_disc_in_its_way() -> None:
     assert seen[0] == math.inf
 
 
-def test_a_free_way_is_driven_in_the_time_of_full_marks() -> None:
-    trial = drive_functions(field(NONE), 0, HARD, QUICK)
+def test_an_empty_world_is_driven_fast_enough_for_the_full_score() -> None:
+    trial = drive_functions(world_of(NO_POSTS), 0, HARD, SAMPLES)
     assert (trial.result, trial.score) == ("success", 0.5)
     assert trial.least_clearance == math.inf
-    again = drive_functions(field(NONE), 0, HARD, QUICK)
+    again = drive_functions(world_of(NO_POSTS), 0, HARD, SAMPLES)
     assert again.seconds == trial.seconds
 
 
-def test_posts_are_gone_round_on_the_hard_plant() -> None:
+def test_the_hard_plant_is_driven_round_posts() -> None:
     posts = np.array([(2.0, 0.1 * i, 0.075) for i in range(-4, 5)])
-    trial = drive_functions(field(posts), 0, HARD, QUICK)
+    trial = drive_functions(world_of(posts), 0, HARD, SAMPLES)
     assert trial.result == "success"
     assert 0.0 < trial.least_clearance < 0.6
 
 
 def test_a_contact_ends_a_trial() -> None:
-    trial = drive_functions(field(np.array([(0.25, 0.0, 0.075)])), 0, HARD, QUICK)
+    trial = drive_functions(world_of(np.array([(0.25, 0.0, 0.075)])), 0, HARD, SAMPLES)
     assert (trial.result, trial.score) == ("collision", 0.0)
 
 
 @pytest.mark.parametrize("plant", [HARD, MUJOCO])
-def test_the_robots_own_nodes_drive_a_world(plant: Conditions) -> None:
+def test_the_nodes_of_the_robot_reach_the_goal(plant: Conditions) -> None:
     posts = np.array([(2.0, 0.1 * i, 0.075) for i in range(-3, 4)])
-    trial = barn.drive_nodes(field(posts), 0, plant, QUICK)
+    trial = barn.drive_nodes(world_of(posts), 0, plant, SAMPLES)
     assert trial.result == "success"
     assert 0.03 < trial.least_clearance < 0.6
 
 
-def test_driven_again_by_its_nodes_a_trial_is_the_same() -> None:
+def test_a_repeated_trial_has_the_same_result() -> None:
     posts = np.array([(1.5, 0.3, 0.075), (1.5, -0.5, 0.075)])
-    one = barn.drive_nodes(field(posts), 1, HARD, QUICK)
+    one = barn.drive_nodes(world_of(posts), 1, HARD, SAMPLES)
     assert one.result == "success"
-    assert barn.drive_nodes(field(posts), 1, HARD, QUICK) == one
+    assert barn.drive_nodes(world_of(posts), 1, HARD, SAMPLES) == one
 
 
 def test_fake_time_does_not_pass_while_kernels_compile() -> None:
-    """On a new installation the robot would not be localized in time, and the bench would end."""
-    course = barn.JudgedCourse(field(NONE), 0, HARD)
-    nodes = barn._nodes(course, QUICK, "nowhere")
+    """Else the bench would fail on a new installation: the robot is not localized in time."""
+    course = barn.JudgedCourse(world_of(NO_POSTS), 0, HARD)
+    nodes = barn._nodes(course, SAMPLES, "nowhere")
     for name in ("perception", "decision"):
         settings = nodes[name].args[0]  # type: ignore[attr-defined]
         assert settings.compile_first
 
 
 def jackal(*posts: tuple[float, float, float]) -> MujocoJackal:
-    calm = Conditions(delay=0.1, drift=0.0, noise=0.0, dropouts=0.0, physics=True)
-    return MujocoJackal(calm, (0.0, 0.0, 0.0), np.array(posts).reshape(-1, 3), 1)
+    no_drift = Conditions(delay=0.1, drift=0.0, noise=0.0, dropouts=0.0, physics=True)
+    return MujocoJackal(no_drift, (0.0, 0.0, 0.0), np.array(posts).reshape(-1, 3), 1)
 
 
-def told(body: MujocoJackal, seconds: float, v: float, w: float) -> None:
+def drive(body: MujocoJackal, seconds: float, v: float, w: float) -> None:
     for _ in range(round(seconds * 50)):
         body.tick(Velocity(linear_x=v, angular_z=w))
 
 
-def test_in_mujoco_it_turns_less_than_its_wheels_say_on_the_spot_and_more_at_speed() -> None:
+def test_in_mujoco_it_turns_too_little_on_the_spot_and_too_much_at_speed() -> None:
     slow, quick = jackal(), jackal()
-    told(slow, 2.0, 0.0, 1.0)
-    told(quick, 2.0, 2.0, 1.0)
+    drive(slow, 2.0, 0.0, 1.0)
+    drive(quick, 2.0, 2.0, 1.0)
     assert 0.6 < slow.velocity.angular_z < 0.85
     assert 1.2 < quick.velocity.angular_z < 1.5
     assert abs(slow.x) < 0.1
     assert abs(slow.y) < 0.1
 
 
-def test_in_mujoco_it_is_as_fast_as_commanded_after_delay_and_lag() -> None:
+def test_in_mujoco_it_reaches_the_commanded_speed_after_delay_and_lag() -> None:
     body = jackal()
-    told(body, 0.1, 1.0, 0.0)
+    drive(body, 0.1, 1.0, 0.0)
     assert abs(body.velocity.linear_x) < 0.01
-    told(body, 2.0, 1.0, 0.0)
+    drive(body, 2.0, 1.0, 0.0)
     assert body.velocity.linear_x == pytest.approx(1.0, abs=0.02)
     assert body.odometry.x == pytest.approx(body.x, abs=0.03)
 
@@ -153,19 +153,19 @@ def test_in_mujoco_it_is_stopped_by_a_post_that_its_lidar_sees() -> None:
     body, posts = jackal(post), np.array([post])
     assert body.scan(LIDAR, posts)[359:361] == pytest.approx([0.87, 0.87], abs=1e-3)
     assert body.clearance(posts) == pytest.approx(1.0 - 0.229 - 0.075)
-    told(body, 3.0, 0.5, 0.0)
+    drive(body, 3.0, 0.5, 0.0)
     assert body.x == pytest.approx(0.696, abs=0.03)
     assert body.clearance(posts) < 0.01
 
 
-def test_moving_discs_go_from_key_to_key_over_and_over() -> None:
+def test_moving_discs_repeat_their_keyframes() -> None:
     mover = MovingDisc(4.0, np.array([(0.0, 0.0, 1.0), (4.0, 2.0, 1.0)]), 0.5)
-    world = BarnWorld(1, NONE, (mover,), (0.0, 0.0, 0.0), (1.0, 0.0), 20.0)
+    world = BarnWorld(1, NO_POSTS, (mover,), (0.0, 0.0, 0.0), (1.0, 0.0), 20.0)
     assert world.discs(1.0).tolist() == [[0.5, 1.0, 0.5]]
     assert world.discs(9.0).tolist() == [[0.5, 1.0, 0.5]]
 
 
-def test_worlds_are_read_and_chosen(tmp_path: Path) -> None:
+def test_worlds_are_read_from_a_file_and_chosen_by_number(tmp_path: Path) -> None:
     meta = {"start": [-2.25, 3.0, 1.57], "goal": [-2.25, 13.0]}
     file = tmp_path / "worlds.npz"
     np.savez(
@@ -185,7 +185,7 @@ def test_worlds_are_read_and_chosen(tmp_path: Path) -> None:
         choose_worlds(worlds, "three")
 
 
-def test_a_file_that_holds_no_worlds_is_refused(tmp_path: Path) -> None:
+def test_a_file_without_worlds_is_refused(tmp_path: Path) -> None:
     file = tmp_path / "worlds.npz"
     with pytest.raises(ConfigError, match=r"cannot read .*No such file"):
         read_worlds(file, dynamic=False)

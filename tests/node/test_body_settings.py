@@ -24,7 +24,7 @@ async def driving(robot: RobotInMemory) -> None:
     raise AssertionError(robot.causes)
 
 
-async def test_a_speed_limit_is_obeyed_by_the_gate_whoever_commands(tmp_path: Path) -> None:
+async def test_the_gate_applies_a_speed_limit_to_every_commander(tmp_path: Path) -> None:
     async with RobotInMemory(tmp_path) as robot:
         await driving(robot)
         await robot.operator.ask(ENABLE, EnableRequest(source="hasty", take=True))
@@ -39,7 +39,7 @@ async def test_a_speed_limit_is_obeyed_by_the_gate_whoever_commands(tmp_path: Pa
         assert speeds[-1] == pytest.approx(0.1)
 
 
-async def test_a_driving_body_slows_down_to_a_new_limit_at_its_ramp(tmp_path: Path) -> None:
+async def test_a_driving_body_slows_down_to_a_new_limit_on_its_ramp(tmp_path: Path) -> None:
     async with RobotInMemory(tmp_path) as robot:
         await driving(robot)
         robot.bus("driver").params.change("max_linear_speed", "0.1")
@@ -51,7 +51,7 @@ async def test_a_driving_body_slows_down_to_a_new_limit_at_its_ramp(tmp_path: Pa
 
 
 async def stop_zone(robot: RobotInMemory) -> float:
-    """The free way [m] that safety wants at 0.1 m/s, by the body that it has received."""
+    """Return safety's stop zone ahead at 0.1 m/s [m], for the newest body description."""
     bodies = robot.operator.latest(BODY)
     await robot.go(60)
     assert bodies.newest
@@ -65,7 +65,7 @@ async def test_a_stop_margin_reaches_safety_and_its_caps(tmp_path: Path) -> None
         robot.bus("driver").params.change("stop_margin", "0.5")
         assert await stop_zone(robot) == pytest.approx(before + 0.42)
         caps = []
-        robot.operator.subscribe(SAFETY, lambda _key, said: caps.append(said.caps.forward))
+        robot.operator.subscribe(SAFETY, lambda _key, state: caps.append(state.caps.forward))
         robot.bus("driver").params.change("stop_margin", "3.2")  # the wall is 3 m away
         speeds = await robot.go(100)
         assert caps[-1] == 0.0
@@ -89,7 +89,7 @@ async def test_a_stop_margin_reaches_safety_and_its_caps(tmp_path: Path) -> None
         ("stop_margin", "much", "expected"),
     ],
 )
-async def test_what_is_unsafe_is_refused_and_changes_nothing(
+async def test_unsafe_settings_are_refused_and_change_nothing(
     tmp_path: Path, name: str, value: str, reason: str
 ) -> None:
     async with RobotInMemory(tmp_path) as robot:
@@ -105,7 +105,7 @@ async def test_what_is_unsafe_is_refused_and_changes_nothing(
         assert {one.name: one.value for one in params.all()} == before
 
 
-async def test_settings_change_one_after_the_other_and_back(tmp_path: Path) -> None:
+async def test_several_settings_can_be_changed_and_changed_back(tmp_path: Path) -> None:
     async with RobotInMemory(tmp_path) as robot:
         params, bodies = robot.bus("driver").params, robot.operator.latest(BODY)
         await robot.go(1)
@@ -121,20 +121,20 @@ async def test_settings_change_one_after_the_other_and_back(tmp_path: Path) -> N
         assert bodies.newest.description == load_robot("mock").description()
 
 
-async def test_every_setting_names_its_place_in_a_file(tmp_path: Path) -> None:
+async def test_every_setting_has_a_key_in_robot_files(tmp_path: Path) -> None:
     async with RobotInMemory(tmp_path) as robot:
         await robot.go(1)
         keys = {one.key for one in robot.bus("driver").params.all() if one.key}
-        sideways = "robot.max_lateral_speed"  # which the mock body does not have
+        sideways = "robot.max_lateral_speed"  # the mock body cannot drive sideways
         assert keys == {f"robot.{path}" for path, one in SETTINGS.items() if one.live} - {sideways}
 
 
-def test_a_slower_car_turns_as_tightly_as_before() -> None:
+def test_a_speed_limit_keeps_the_turning_radius_of_a_car() -> None:
     slow = restricted(CAR, {"max_linear_speed": 0.5})
     assert slow.max_linear_speed / slow.max_angular_speed == pytest.approx(0.5)
 
 
-def test_a_tolerance_is_never_more_than_a_slower_body_can_be_off() -> None:
+def test_a_speed_limit_caps_the_following_tolerance() -> None:
     thresholds = replace(WAFFLE.thresholds, follow_linear=0.2)
     slow = restricted(replace(WAFFLE, thresholds=thresholds), {"max_linear_speed": 0.1})
     assert slow.thresholds.follow_linear == 0.1

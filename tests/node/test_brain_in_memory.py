@@ -1,4 +1,4 @@
-"""A whole robot, in memory and in fake time: it drives, and whatever falls silent stops it."""
+"""A whole robot, in memory and in fake time: it drives, and a silent process stops it."""
 
 import itertools
 from pathlib import Path
@@ -11,7 +11,7 @@ from gigabrain_schemas.requests import EnableRequest, EstopRequest, GateReply, R
 from gigabrain_schemas.topics import CMD_VEL, ENABLE, ESTOP, RELEASE
 from gigabrain_zenoh.testing.in_memory import RobotInMemory, ticks_until, travelled
 
-# after how many ticks the body brakes, and how far it may go until it stands still [m]
+# process, ticks until the body brakes, and the longest way until it stands still [m]
 SILENCES = [
     ("perception", 13, 0.15),
     ("decision", 6, 0.10),
@@ -21,7 +21,7 @@ SILENCES = [
 
 
 async def driving(robot: RobotInMemory) -> None:
-    """Wait until it is at full speed."""
+    """Wait until the robot drives at full speed."""
     await robot.go(100)
     assert robot.mode == "enabled"
     assert robot.body.speeds[-1] == pytest.approx(0.26)
@@ -40,17 +40,17 @@ async def press(robot: RobotInMemory) -> GateReply:
     return (await robot.operator.ask(ESTOP, EstopRequest(source="test")))[0]
 
 
-def stops(speeds: list[float], ticks: int, metres: float) -> None:
-    """It brakes in time, on a ramp and for good, and gets no farther than it may."""
+def assert_stops(speeds: list[float], ticks: int, metres: float) -> None:
+    """Assert that it brakes in time and on a ramp, stays at rest, and stops within `metres`."""
     assert ticks_until(speeds, lambda v: v < 0.259) - 1 <= ticks
-    still = ticks_until(speeds, lambda v: v == 0.0)
-    assert still - 1 <= ticks + 13  # 0.26 m/s at 1 m/s²
-    assert set(speeds[still:]) <= {0.0}
+    rest_tick = ticks_until(speeds, lambda v: v == 0.0)
+    assert rest_tick - 1 <= ticks + 13  # 0.26 m/s at 1 m/s²
+    assert set(speeds[rest_tick:]) <= {0.0}
     assert travelled(speeds) <= metres
     assert max(a - b for a, b in itertools.pairwise(speeds)) < 0.0201
 
 
-async def test_it_enables_itself_and_drives_straight_on(tmp_path: Path) -> None:
+async def test_it_enables_itself_and_drives_straight_ahead(tmp_path: Path) -> None:
     async with RobotInMemory(tmp_path) as robot:
         speeds = await robot.go(200)
         assert robot.state
@@ -58,20 +58,20 @@ async def test_it_enables_itself_and_drives_straight_on(tmp_path: Path) -> None:
     assert pose.x == pytest.approx(travelled(speeds), abs=0.006)
     assert pose.x > 0.5
     assert (pose.y, pose.yaw) == (0.0, 0.0)
-    ups = [b - a for a, b in itertools.pairwise(speeds)]
-    assert max(ups) == pytest.approx(0.02)  # 1 m/s²
-    assert min(ups) >= 0.0
+    gains = [b - a for a, b in itertools.pairwise(speeds)]
+    assert max(gains) == pytest.approx(0.02)  # 1 m/s²
+    assert min(gains) >= 0.0
     assert speeds[-1] == pytest.approx(0.26)
 
 
 @pytest.mark.parametrize(("name", "ticks", "metres"), SILENCES)
-async def test_a_process_that_dies_stops_the_body_and_it_goes_on_when_it_is_back(
+async def test_a_dead_process_stops_the_body_until_its_restart(
     name: str, ticks: int, metres: float, tmp_path: Path
 ) -> None:
     async with RobotInMemory(tmp_path) as robot:
         await driving(robot)
         await robot.kill(name)
-        stops(await robot.go(100), ticks, metres)
+        assert_stops(await robot.go(100), ticks, metres)
         assert robot.mode == "idle"
         robot.start(name)
         await robot.go(100)
@@ -80,7 +80,7 @@ async def test_a_process_that_dies_stops_the_body_and_it_goes_on_when_it_is_back
 
 
 @pytest.mark.parametrize(("name", "ticks", "metres"), SILENCES)
-async def test_a_process_that_freezes_stops_the_body_and_nothing_stale_comes_of_it(
+async def test_a_frozen_process_stops_the_body_and_thawed_moves_nothing(
     name: str, ticks: int, metres: float, tmp_path: Path
 ) -> None:
     async with RobotInMemory(tmp_path, resume="manual") as robot:
@@ -89,9 +89,9 @@ async def test_a_process_that_freezes_stops_the_body_and_nothing_stale_comes_of_
         await enable(robot)
         await driving(robot)
         robot.freeze(name)
-        stops(await robot.go(250), ticks, metres)
+        assert_stops(await robot.go(250), ticks, metres)
         robot.thaw(name)
-        assert set(await robot.go(100)) == {0.0}  # all that was missed came at once
+        assert set(await robot.go(100)) == {0.0}  # all missed messages arrive at once
         assert robot.mode == "idle"
         assert robot.counters["stale_commands_executed"] == 0
         assert (await enable(robot)).ok
@@ -119,9 +119,9 @@ async def test_an_estop_stops_in_the_same_tick_and_stays_latched(tmp_path: Path)
         assert set(await robot.go(200)) == {0.0}
         assert (robot.mode, robot.causes) == ("latched", ["estop"])
         assert not (await enable(robot)).ok
-        assert not (await release(robot, 0)).ok  # of a stop that nobody has looked at
+        assert not (await release(robot, 0)).ok  # generation 0 is older than the e-stop
         assert (await release(robot, 1)).ok
-        assert set(await robot.go(100)) == {0.0}  # nor does it go on by itself
+        assert set(await robot.go(100)) == {0.0}  # it does not resume by itself
         assert (await enable(robot)).ok
         await driving(robot)
 
@@ -137,7 +137,7 @@ async def test_an_estop_survives_a_restart_of_the_driver(tmp_path: Path) -> None
         assert (await release(robot, 1)).ok
 
 
-async def test_a_driver_that_starts_anew_finds_a_brain_that_begins_anew(tmp_path: Path) -> None:
+async def test_after_a_restart_of_the_driver_the_brain_drives_again(tmp_path: Path) -> None:
     async with RobotInMemory(tmp_path) as robot:
         await driving(robot)
         assert robot.state
@@ -149,7 +149,7 @@ async def test_a_driver_that_starts_anew_finds_a_brain_that_begins_anew(tmp_path
         assert robot.counters["stale_commands_executed"] == 0
 
 
-async def test_commands_that_are_played_back_move_nothing(tmp_path: Path) -> None:
+async def test_replayed_commands_move_nothing(tmp_path: Path) -> None:
     async with RobotInMemory(tmp_path, resume="manual") as robot:
         await robot.go(50)
         await release(robot, 0)
@@ -159,16 +159,16 @@ async def test_commands_that_are_played_back_move_nothing(tmp_path: Path) -> Non
         await robot.go(30)
         await release(robot, 1)
         await robot.kill("control")
-        legal = [payload for key, payload in robot.network.sent if key == CMD_VEL.key]
-        assert len(legal) > 150
-        for payload in legal:
+        recorded = [payload for key, payload in robot.network.sent if key == CMD_VEL.key]
+        assert len(recorded) > 150
+        for payload in recorded:
             robot.network.deliver(CMD_VEL.key, payload)
         assert set(await robot.go(50)) == {0.0}
         assert (await enable(robot)).ok is False
         assert robot.counters["refused_old"] > 100
 
 
-async def test_a_second_estop_counts_after_a_restart_too(tmp_path: Path) -> None:
+async def test_the_count_of_estops_survives_a_restart(tmp_path: Path) -> None:
     async with RobotInMemory(tmp_path) as robot:
         await driving(robot)
         await press(robot)
@@ -176,11 +176,11 @@ async def test_a_second_estop_counts_after_a_restart_too(tmp_path: Path) -> None
         await robot.kill("driver")
         robot.start_driver()
         await robot.go(50)
-        assert not (await release(robot, 1)).ok  # of the stop before the last
+        assert not (await release(robot, 1)).ok  # generation 1 is not the newest e-stop
         assert (await release(robot, 2)).ok
 
 
-async def test_a_speed_that_is_not_a_number_stops_the_body_at_once(tmp_path: Path) -> None:
+async def test_a_nan_speed_stops_the_body_at_once(tmp_path: Path) -> None:
     async with RobotInMemory(tmp_path, resume="manual") as robot:
         await robot.go(50)
         await release(robot, 0)

@@ -1,4 +1,4 @@
-"""Cameras that are read: a source that hangs, is lost, or sends the wrong thing harms nobody."""
+"""Camera sources that hang, get lost, or send wrong pictures do not end the process."""
 
 import asyncio
 import functools
@@ -38,7 +38,7 @@ SIZE = (240, 320, 3)
 
 
 class Scripted(CameraSource):
-    """A camera whose next exposures the test chooses."""
+    """A camera whose faults the test sets."""
 
     opened = 0
     hangs = threading.Event()
@@ -109,7 +109,7 @@ async def test_a_picture_has_the_newest_tick_and_a_new_stamp(tmp_path: Path) -> 
         assert 0 <= bus.clock.unix_ns() - newest.stamp_ns < 10**9
 
 
-async def test_a_source_that_hangs_is_named_and_the_process_goes_on(tmp_path: Path) -> None:
+async def test_a_hanging_source_is_reported_and_the_process_goes_on(tmp_path: Path) -> None:
     async with running(tmp_path) as (bus, received):
         Scripted.hangs.set()
         await until(lambda: problem(received) == "no picture", "the silence")
@@ -118,7 +118,7 @@ async def test_a_source_that_hangs_is_named_and_the_process_goes_on(tmp_path: Pa
         await until(lambda: problem(received) == "", "the end of it")
 
 
-async def test_a_source_that_is_lost_is_opened_again(tmp_path: Path) -> None:
+async def test_a_lost_source_is_reopened(tmp_path: Path) -> None:
     async with running(tmp_path) as (_, received):
         Scripted.lost = "the cable is out"
         await until(lambda: problem(received) == "no picture: the cable is out", "the loss")
@@ -129,7 +129,7 @@ async def test_a_source_that_is_lost_is_opened_again(tmp_path: Path) -> None:
         assert problem(received) == ""
 
 
-async def test_the_advice_is_about_the_source_where_that_says_what_is_wrong(tmp_path: Path) -> None:
+async def test_the_remedy_depends_on_the_error_of_the_source(tmp_path: Path) -> None:
     def advice(bus: Bus) -> str:
         return bus.problems[0].remedy if bus.problems else ""
 
@@ -144,7 +144,7 @@ async def test_the_advice_is_about_the_source_where_that_says_what_is_wrong(tmp_
         assert advice(bus) == "check its cable, or connect it again"
 
 
-async def test_a_picture_of_another_size_is_withheld_and_said(tmp_path: Path) -> None:
+async def test_a_picture_of_wrong_size_is_reported_and_not_published(tmp_path: Path) -> None:
     async with running(tmp_path) as (_, received):
         Scripted.size = (200, 320, 3)
         await until(lambda: "320 x 200" in problem(received), "the size")
@@ -156,7 +156,7 @@ async def test_a_picture_of_another_size_is_withheld_and_said(tmp_path: Path) ->
         await until(lambda: problem(received) == "", "the end of it")
 
 
-async def test_a_picture_that_nobody_would_take_is_withheld_and_said(
+async def test_a_too_large_picture_is_reported_and_not_published(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     async with running(tmp_path) as (_, received):
@@ -167,7 +167,7 @@ async def test_a_picture_that_nobody_would_take_is_withheld_and_said(
         assert len(received["image"]) == before
 
 
-async def test_a_source_that_breaks_ends_the_process_with_its_own_error(
+async def test_an_unexpected_exception_of_a_source_ends_the_process(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def broken(_: Scripted) -> Frame:

@@ -1,4 +1,4 @@
-"""A simulation whose driver dies goes on where it was, in the same run only."""
+"""A simulation continues from its checkpoint when its driver dies, within the same run."""
 
 import logging
 import math
@@ -49,34 +49,34 @@ def run(one: Simulation, seconds: float) -> None:
 
 
 def resumed(one: Simulation, body: str = WAFFLE, world: str = "arena") -> Simulation:
-    """Return a simulation that goes on from the checkpoint of `one`, as a new process does."""
+    """Return a simulation that continues from the checkpoint of `one`, as a new process does."""
     text = msgspec.msgpack.encode(one.checkpoint())
     return simulation(body, world, msgspec.msgpack.decode(text, type=Checkpoint))
 
 
-def place(one: Simulation) -> tuple[float, float, float]:
+def true_pose(one: Simulation) -> tuple[float, float, float]:
     pose = one.truth.pose()
     return pose.x, pose.y, pose.yaw
 
 
 @pytest.mark.parametrize("body", [WAFFLE, "lekiwi", "ackermann_car"])
-def test_a_body_stands_where_it_was_and_its_odometry_begins_at_zero(body: str) -> None:
+def test_a_resumed_body_keeps_its_pose_and_its_odometry_starts_at_zero(body: str) -> None:
     before = simulation(body)
     before.drive(0.15, 0.0, 0.4)
     run(before, 2)
     after = resumed(before, body)
-    assert place(after) == pytest.approx(place(before))
+    assert true_pose(after) == pytest.approx(true_pose(before))
     assert after.time_ns == 2_000_000_000
     assert after.battery().percentage == before.battery().percentage
     assert after.truth.distance_m == before.truth.distance_m > 0.1
     run(after, 1)
-    assert place(after) == pytest.approx(place(before), abs=0.005)
+    assert true_pose(after) == pytest.approx(true_pose(before), abs=0.005)
     assert after.odometry() == pytest.approx((0, 0, 0, 0, 0), abs=0.01)
     _, _, z, w = after.imu().orientation
     assert 2 * math.atan(z / w) == pytest.approx(0, abs=0.02)
 
 
-def test_an_arm_keeps_its_goals_and_one_that_was_limp_stays_limp() -> None:
+def test_a_resumed_arm_keeps_its_targets_and_a_limp_one_stays_limp() -> None:
     before = simulation("so101", "table")
     assert before.arm
     name = before.arm.names[0]
@@ -96,7 +96,7 @@ def test_an_arm_keeps_its_goals_and_one_that_was_limp_stays_limp() -> None:
     assert last.model.actuator_gainprm[:, 0].max() == 0.0
 
 
-def test_a_quadruped_that_trots_stands_and_does_not_fall() -> None:
+def test_a_quadruped_resumed_in_mid_trot_does_not_fall() -> None:
     for steps in (5, 23, 41):
         before = simulation("alpha")
         before.drive(0.2, 0.0, 0.0)
@@ -104,18 +104,18 @@ def test_a_quadruped_that_trots_stands_and_does_not_fall() -> None:
         after = resumed(before, "alpha")
         run(after, 2)
         assert not after.fallen
-        assert math.dist(place(after)[:2], place(before)[:2]) < 0.1
+        assert math.dist(true_pose(after)[:2], true_pose(before)[:2]) < 0.1
 
 
-def test_things_people_and_the_account_of_the_run_stay() -> None:
+def test_added_things_people_and_counted_contacts_are_resumed() -> None:
     before = simulation(world="playroom")
-    x, y, yaw = place(before)
+    x, y, yaw = true_pose(before)
     ahead = x + 0.4 * math.cos(yaw), y + 0.4 * math.sin(yaw)
     before.things.add(Thing(name="crate", x=ahead[0], y=ahead[1], size=(0.2, 0.2, 0.3)))
     walk = Thing(kind="person", x=x, y=y + 2, path=((x + 1, y + 2),))
     before.things.add(walk)
     before.command(0.2, 0.0)
-    run(before, 4)  # into the box
+    run(before, 4)  # until it hits the box
     assert before.truth.contacts == 1
     after = resumed(before, world="playroom")
     assert after.things.all() == before.things.all()
@@ -125,10 +125,10 @@ def test_things_people_and_the_account_of_the_run_stay() -> None:
     run(after, 0.2)
     assert after.truth.contacts == 1  # it still touches the box
     same = np.isclose(after.scan(), before.scan(), atol=0.1)
-    assert same.mean() > 0.9  # but for people, and beams that pass an edge
+    assert same.mean() > 0.9  # except at people and edges
 
 
-def test_what_the_robot_has_moved_stays_there(tmp_path: Path) -> None:
+def test_a_pushed_crate_stays_at_its_new_place(tmp_path: Path) -> None:
     path = tmp_path / "room.xml"
     path.write_text(BOX_IN_ROOM)
     before = simulation(world=str(path))
@@ -156,7 +156,7 @@ def test_the_newest_intact_checkpoint_is_read(tmp_path: Path) -> None:
         files.write(one.checkpoint())
     assert CheckpointFiles(path).read() == one.checkpoint()
     newest = Path(f"{path}.0")
-    newest.write_bytes(newest.read_bytes()[:100])  # killed while it wrote
+    newest.write_bytes(newest.read_bytes()[:100])  # as if the process was killed while it wrote
     older = CheckpointFiles(path).read()
     assert older
     assert older.steps == 2
@@ -179,7 +179,7 @@ def driver(
 
 
 async def drive(one: MujocoDriver, ticks: int) -> dict[str, Any]:
-    """Drive for some ticks; return the report. Files are left as a killed process leaves them."""
+    """Drive for some ticks; return the report. Files stay as after a kill of the process."""
     async with one:
         times = one.ticks(Clock())
         for _ in range(ticks):
@@ -189,7 +189,7 @@ async def drive(one: MujocoDriver, ticks: int) -> dict[str, Any]:
     return dict(one.report())
 
 
-async def test_the_next_driver_of_a_run_goes_on_where_the_last_one_died(tmp_path: Path) -> None:
+async def test_the_next_driver_of_a_run_continues_where_the_last_one_died(tmp_path: Path) -> None:
     path = tmp_path / "checkpoint"
     first = await drive(driver(path, seconds=4.0), 100)
     second = driver(path, seconds=4.0)
@@ -197,8 +197,8 @@ async def test_the_next_driver_of_a_run_goes_on_where_the_last_one_died(tmp_path
     assert second.report()["sim_seconds"] == pytest.approx(2.0, abs=0.1)
     async with second:
         assert (await second.read_state()).pose.x == 0.0
-    left = [tick async for tick in driver(path, seconds=2.2).ticks(Clock())]  # they count on
-    assert 10 <= len(left) <= 20  # and for as long as a checkpoint may be newer than a state
+    left = [tick async for tick in driver(path, seconds=2.2).ticks(Clock())]  # continues counting
+    assert 10 <= len(left) <= 20  # the checkpoint may be 10 ticks old
     third = driver(path, seconds=1.0)
     assert len([tick async for tick in third.ticks(Clock())]) == 5
     assert third.finished
@@ -215,7 +215,7 @@ def overwrite(checkpoint: Path, content: bytes) -> None:
     ("world", "content", "why"),
     [("house", None, "of another body or world"), ("arena", b"?" * 99, "damaged")],
 )
-async def test_a_driver_that_cannot_go_on_begins_at_the_start_and_says_so(
+async def test_a_driver_without_a_usable_checkpoint_starts_over_with_a_warning(
     tmp_path: Path, world: str, content: bytes | None, why: str, caplog: pytest.LogCaptureFixture
 ) -> None:
     path = tmp_path / "checkpoint"
@@ -226,14 +226,12 @@ async def test_a_driver_that_cannot_go_on_begins_at_the_start_and_says_so(
         again = await drive(driver(path, world), 10)
     assert again["sim_seconds"] == 0.2
     assert why in caplog.text
-    third = driver(path, world)  # which finds the checkpoint of the second
+    third = driver(path, world)  # resumes from the checkpoint of the second one
     assert third.report()["sim_seconds"] == 0.2
     await third.close()
 
 
-async def test_a_body_that_fell_begins_at_the_start_again(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+async def test_a_fallen_body_starts_over(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "checkpoint"
     await drive(driver(path), 10)
     monkeypatch.setattr(Simulation, "fallen", True)
@@ -242,7 +240,7 @@ async def test_a_body_that_fell_begins_at_the_start_again(
     assert CheckpointFiles(path).read() is None
 
 
-async def test_a_full_disk_stops_no_tick_and_leaves_no_old_checkpoint(
+async def test_a_full_disk_delays_no_tick_and_leaves_no_old_checkpoint(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     path = tmp_path / "checkpoint"
@@ -259,7 +257,9 @@ async def test_a_full_disk_stops_no_tick_and_leaves_no_old_checkpoint(
 
 
 @pytest.mark.parametrize(("link", "kept"), [("sim", True), ("emulated", False), ("real", False)])
-def test_each_run_has_checkpoints_of_its_own(link: LinkName, kept: bool, tmp_path: Path) -> None:
+def test_each_simulated_run_has_its_own_checkpoint(
+    link: LinkName, kept: bool, tmp_path: Path
+) -> None:
     for run_dir in (tmp_path / "one", tmp_path / "two"):
         specs = process_specs(Deployment(link=link), "robot", run_dir, tmp_path / "state")
         (spec,) = (one for one in specs if one.name == "driver")
@@ -267,7 +267,7 @@ def test_each_run_has_checkpoints_of_its_own(link: LinkName, kept: bool, tmp_pat
         assert settings["checkpoint"] == (str(run_dir / "checkpoint") if kept else "")
 
 
-async def test_a_disk_that_hangs_holds_up_no_tick(
+async def test_a_hanging_disk_delays_no_tick(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path, hangs = tmp_path / "checkpoint", threading.Event()

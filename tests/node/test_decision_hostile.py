@@ -1,4 +1,4 @@
-"""Extreme messages to decision: speeds are limited, and it still reaches its goal."""
+"""Extreme messages to decision: it limits their speeds, and still reaches its goal."""
 
 import msgspec
 
@@ -17,7 +17,7 @@ from gigabrain_zenoh.testing.waiting import settle
 from tests.node.plane import ROOM, Plane, as_map, drawn
 
 
-async def test_the_brains_own_commands_are_clamped_like_in_the_gate() -> None:
+async def test_decision_clamps_the_sent_commands_as_the_gate_does() -> None:
     net = Net()
     source = ContextSource(net.two, ZoneSource(net.two))
     for bus in (net.one, net.two):
@@ -35,8 +35,8 @@ async def test_the_brains_own_commands_are_clamped_like_in_the_gate() -> None:
     ]
 
 
-def said(plane: Plane, topic: object) -> Message | None:
-    """Return the robot's own map, state or body at this tick; None for other topics."""
+def plausible_message(plane: Plane, topic: object) -> Message | None:
+    """Return the robot's map, state or body at this tick; None for other topics."""
     match topic:
         case topics.MAP:
             return as_map(plane.known, plane.tick, plane.boot)
@@ -54,7 +54,7 @@ async def test_decision_survives_extreme_messages_and_reaches_its_goal_afterward
         await plane.go(0.2)
         await plane.ask_at_once(GOAL, GoalRequest(x=4.0, y=0.8))
         for case in (one for one in chosen_extremes() if one.to in received):
-            own = said(plane, case.to)
+            own = plausible_message(plane, case.to)
             base = msgspec.msgpack.decode(codec.encode(own)) if own else None
             header = {"boot": plane.boot, "tick": plane.tick, "basis": plane.tick}
             plane.bench.network.deliver(case.key, case.payload(base, header))

@@ -1,4 +1,4 @@
-"""The driver of a simulated body dies and starts again, while the brain goes on with its map."""
+"""The driver of a simulated body dies and restarts, while the brain keeps its map."""
 
 import asyncio
 import math
@@ -24,7 +24,7 @@ from gigabrain_zenoh.geometry.se2 import between
 from gigabrain_zenoh.perception import node as perception
 from gigabrain_zenoh.safety import node as safety
 
-WAFFLE, WORLD = "turtlebot3_waffle", "arena"  # where scans look alike in 16 places
+WAFFLE, WORLD = "turtlebot3_waffle", "arena"  # its scans look alike at 16 places
 Node = Callable[[Bus, Callable[[], None]], Awaitable[None]]
 BRAIN: tuple[Node, ...] = (
     lambda bus, ready: perception.run(PerceptionConfig(mapping="slam"), bus, ready),
@@ -50,7 +50,7 @@ async def brain(network: LocalNetwork) -> AsyncIterator[list["asyncio.Future[Non
 
 
 async def drive(network: LocalNetwork, folder: Path, seconds: float) -> dict[str, object]:
-    """Have the brain drive until this second of the run, then let the driver die."""
+    """Let the brain drive until `seconds` of the run, then end the driver; return its report."""
     run = Run(
         folder=Path(), world=WORLD, speed=100.0, seconds=seconds, checkpoint=str(folder / "cp")
     )
@@ -71,7 +71,9 @@ async def drive(network: LocalNetwork, folder: Path, seconds: float) -> dict[str
     return dict(driver.report())
 
 
-async def test_the_robot_is_found_in_its_map_again_and_drives_on(tmp_path: Path) -> None:
+async def test_after_the_death_of_the_driver_the_robot_is_localized_and_drives_on(
+    tmp_path: Path,
+) -> None:
     network, poses = LocalNetwork(), list[PoseInMap]()
     watcher = Bus(network.transport(), Clock())
     watcher.subscribe(POSE, lambda _, pose: poses.append(pose))
@@ -80,10 +82,10 @@ async def test_the_robot_is_found_in_its_map_again_and_drives_on(tmp_path: Path)
         assert poses[-1].localized
         boot = poses[-1].boot
         after = await drive(network, tmp_path, 14.0)
-    found = [pose for pose in poses if pose.boot != boot and pose.localized]
-    assert len(found) > 30  # of six seconds
-    began = load_world(WORLD, 0).start
+    localized = [pose for pose in poses if pose.boot != boot and pose.localized]
+    assert len(localized) > 30  # of 60 poses in 6 s
+    start_pose = load_world(WORLD, 0).start
     x, y, yaw = (float(str(after[name])) for name in ("true_x", "true_y", "true_yaw"))
-    truth = between(np.array((began.x, began.y, began.yaw)), np.array((x, y, yaw)))
-    assert math.dist((found[-1].x, found[-1].y), truth[:2].tolist()) < 0.15
+    truth = between(np.array((start_pose.x, start_pose.y, start_pose.yaw)), np.array((x, y, yaw)))
+    assert math.dist((localized[-1].x, localized[-1].y), truth[:2].tolist()) < 0.15
     assert float(str(after["distance_m"])) > float(str(before["distance_m"])) + 0.5

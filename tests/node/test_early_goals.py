@@ -27,26 +27,28 @@ NAVIGATE = DecisionConfig(behaviour="navigate")
 async def test_a_goal_is_accepted_while_decision_starts(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    warm = asyncio.Event()
+    may_compile = asyncio.Event()
 
     async def compiled_later(warm_up: str) -> None:
-        await warm.wait()
+        await may_compile.wait()
         await ensure_compiled(warm_up)
 
     monkeypatch.setattr(precompile, "ensure_compiled", compiled_later)
-    told: list[TaskStatus] = []
+    statuses: list[TaskStatus] = []
     async with NodeBench(functools.partial(decision.run, NAVIGATE)) as bench:
         operator = Bus(bench.network.transport(), bench.clock, "operator")
-        operator.subscribe(TASK, lambda _key, status: told.append(status))
+        operator.subscribe(TASK, lambda _key, status: statuses.append(status))
         replies = await operator.ask(GOAL, GoalRequest(x=4.0, y=0.8, source="ann"))
         assert replies == [GoalReply(ok=True, text=f"goal-1: accepted; {WaitReason.STARTING}",
                                      goal="goal-1")]  # fmt: skip
         for _ in range(3):
             await bench.clock.advance(200_000_000)
-        assert len(told) >= 3
-        assert progress("goal-1", told[-1]) == f"goal-1: accepted, waiting: {WaitReason.STARTING}"
+        assert len(statuses) >= 3
+        assert (
+            progress("goal-1", statuses[-1]) == f"goal-1: accepted, waiting: {WaitReason.STARTING}"
+        )
         assert not bench.sent(INTENT)
-        warm.set()
+        may_compile.set()
         await bench.ready()
         await operator.close()
 
@@ -84,7 +86,7 @@ async def test_a_goal_waits_for_the_first_localization() -> None:
         await plane.until("succeeded", seconds=60)
 
 
-async def test_a_missing_package_is_named_with_the_command_to_install_it(
+async def test_the_error_for_a_missing_package_has_the_command_to_install_it(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     for name in ("gigabrain_zenoh.kernels.jit", "numba"):
@@ -93,13 +95,15 @@ async def test_a_missing_package_is_named_with_the_command_to_install_it(
         await ensure_compiled("gigabrain_zenoh.kernels.jit:kernel")
 
 
-SERVES = """
+IMPORT_GOAL_SERVER = """
 import sys
 import gigabrain_zenoh.decision.goal_server
 print(*(name for name in ("numba", "gtsam", "scipy") if name in sys.modules))
 """
 
 
-def test_goals_are_served_before_anything_heavy_is_imported() -> None:
-    done = subprocess.run((sys.executable, "-c", SERVES), capture_output=True, text=True)
+def test_the_goal_server_imports_no_heavy_package() -> None:
+    done = subprocess.run(
+        (sys.executable, "-c", IMPORT_GOAL_SERVER), capture_output=True, text=True
+    )
     assert (done.returncode, done.stdout) == (0, "\n"), done.stderr

@@ -1,4 +1,4 @@
-"""The emulated servos of an arm in MuJoCo hold it, however late their own loop is."""
+"""The emulated servos of an arm in MuJoCo hold it although their loop is late."""
 
 import random
 from pathlib import Path
@@ -20,15 +20,15 @@ from gigabrain_drivers.sim.worlds import load_world
 RAISED = (0.0, 0.6, -0.6, -0.3, 0.0, 0.3)  # [rad], stretched forwards
 
 
-class Nowhere:
-    """A line that nobody listens to."""
+class NullWire:
+    """A serial line without a reader."""
 
     def write(self, data: bytes) -> bool:
         return True
 
 
-@pytest.mark.parametrize("late", [0, 5, 15])
-def test_a_raised_arm_is_held_still(late: int) -> None:
+@pytest.mark.parametrize("max_delay_steps", [0, 5, 15])
+def test_a_raised_arm_is_held_still_by_late_servos(max_delay_steps: int) -> None:
     robot, _, options, folder = load_link("so101", Run(folder=Path()))
     assert isinstance(options, MujocoOptions)
     assert robot.emulated
@@ -38,7 +38,7 @@ def test_a_raised_arm_is_held_still(late: int) -> None:
     settings = FeetechOptions(
         driver="feetech", port="none", servos=robot.emulated["servos"], calibration="emulated.yaml"
     )
-    arm, rng = FeetechArm(body, settings, Nowhere()), random.Random(0)
+    arm, rng = FeetechArm(body, settings, NullWire()), random.Random(0)
     arm.reset()
     for servo, goal in zip(arm.servos.values(), RAISED, strict=True):
         servo[feetech.GOAL_VELOCITY], servo[feetech.ACCELERATION] = 2000, 254
@@ -49,7 +49,7 @@ def test_a_raised_arm_is_held_still(late: int) -> None:
         body._step()
         if step >= due:
             arm.step(round(step * STEP_S * 1e9))
-            due = step + 1 + rng.randint(0, late)
+            due = step + 1 + rng.randint(0, max_delay_steps)
         places.append([motor.position for motor in body.joints])
-    assert places[-1] == pytest.approx(RAISED, abs=0.07)  # their gain alone holds the weight
+    assert places[-1] == pytest.approx(RAISED, abs=0.07)  # they sag: no integral gain
     assert np.ptp(places[300:], axis=0).max() < 0.01

@@ -1,4 +1,4 @@
-"""A package may bring a behaviour of its own: entry point `gigabrain.behaviours`."""
+"""A package may bring its own behaviour: entry point `gigabrain.behaviours`."""
 
 from pathlib import Path
 
@@ -91,7 +91,9 @@ def package(site: Path) -> None:
     (site / "foreign_behaviours.py").write_text(SOURCE)
 
 
-async def test_it_drives_with_its_own_settings_and_parameters(tmp_path: Path) -> None:
+async def test_a_packaged_behaviour_drives_with_its_own_settings_and_parameters(
+    tmp_path: Path,
+) -> None:
     file = tmp_path / "robot.yaml"
     file.write_text("decision: {behaviour: spin, settings: {rate: 0.4}}\n")
     config = load_deployment(file).decision
@@ -104,7 +106,7 @@ async def test_it_drives_with_its_own_settings_and_parameters(tmp_path: Path) ->
         assert plane.velocity.angular_z == pytest.approx(0.1)
 
 
-async def test_one_that_needs_a_map_gets_the_navigator() -> None:
+async def test_a_packaged_behaviour_that_needs_a_map_gets_the_navigator() -> None:
     config = DecisionConfig(behaviour="there", settings={"x": 4.0, "y": 0.8})
     assert behaviours.needs_map("there")
     intents: list[Intent] = []
@@ -116,7 +118,7 @@ async def test_one_that_needs_a_map_gets_the_navigator() -> None:
     assert {intent.behaviour for intent in intents} == {"there"}
 
 
-def test_a_demonstration_uses_its_settings_and_its_needs() -> None:
+def test_a_demo_of_a_packaged_behaviour_uses_its_settings_and_a_map() -> None:
     spin = RobotOptions(behaviour="spin").values()
     assert spin["decision"] == {"behaviour": "spin", "settings": {"rate": 0.25}}
     assert "perception" not in spin
@@ -125,7 +127,7 @@ def test_a_demonstration_uses_its_settings_and_its_needs() -> None:
     assert there.perception.mapping == "slam"
 
 
-def test_its_name_and_its_settings_are_checked_like_ours() -> None:
+def test_name_and_settings_of_a_packaged_behaviour_are_checked() -> None:
     with pytest.raises(UnknownName, match=r"did you mean 'spin'\? known: avoid, navigate, spin, t"):
         behaviours.load("spinn")
     with pytest.raises(ConfigError, match="unknown field 'speed'; known: rate"):

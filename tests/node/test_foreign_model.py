@@ -1,4 +1,4 @@
-"""Models of others, in the style of public collections: driven by a table of names, unedited."""
+"""Public MuJoCo models are driven unedited, by a table of names in the robot's file."""
 
 import dataclasses
 import logging
@@ -16,8 +16,8 @@ from gigabrain_drivers.sim.physics import Simulation
 from gigabrain_drivers.sim.world import Pose, World
 from gigabrain_zenoh.errors import ConfigError
 
-# no sensor, no lidar site, no free joint, geoms in groups 2 and 3, wheels that turn backwards,
-# a motor on one wheel and nothing on the other, a caster, a keyframe, options and a scene
+# no sensors, lidar site or free joint; geoms in groups 2 and 3; wheels with reversed axes;
+# a motor on one wheel only; a caster, a keyframe, options and a scene
 MODEL = """
 <mujoco model="cart">
   <compiler angle="radian" autolimits="true"/>
@@ -91,8 +91,8 @@ ROOM = World(
 )
 
 
-def written(folder: Path, *changes: tuple[str, str], model: str = MODEL) -> str:
-    """The robot's file with changes."""
+def robot_file(folder: Path, *changes: tuple[str, str], model: str = MODEL) -> str:
+    """Write the robot's file with changes, and the model; return the path of the file."""
     text = ROBOT
     for old, new in changes:
         assert old in text
@@ -119,7 +119,7 @@ def test_a_model_is_driven_without_editing_it(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     with caplog.at_level(logging.WARNING):
-        simulation = simulated(written(tmp_path))
+        simulation = simulated(robot_file(tmp_path))
     assert not caplog.records
     assert (tmp_path / "cart.xml").read_text() == MODEL
     for _ in range(100):
@@ -141,7 +141,7 @@ def test_a_model_is_driven_without_editing_it(
     assert simulation.truth.contacts == 0
 
 
-def test_an_inertial_unit_that_is_mounted_upside_down_is_read_in_the_bases_frame(
+def test_an_imu_mounted_upside_down_is_read_in_the_frame_of_the_base(
     tmp_path: Path,
 ) -> None:
     model = MODEL.replace(
@@ -150,7 +150,7 @@ def test_an_inertial_unit_that_is_mounted_upside_down_is_read_in_the_bases_frame
     ).replace('<sensor>', '<sensor><gyro name="rate" site="board"/>'
               '<accelerometer name="force" site="board"/>')  # fmt: skip
     names = "    lidar: mast\n    gyro: rate\n    accelerometer: force\n"
-    simulation = simulated(written(tmp_path, ("    lidar: mast\n", names), model=model))
+    simulation = simulated(robot_file(tmp_path, ("    lidar: mast\n", names), model=model))
     for _ in range(300):
         simulation.command(0.0, 1.0)
         simulation.advance()
@@ -158,34 +158,34 @@ def test_an_inertial_unit_that_is_mounted_upside_down_is_read_in_the_bases_frame
     assert simulation.imu().linear_acceleration[2] == pytest.approx(9.81, abs=0.5)
 
 
-def test_its_own_geoms_hide_nothing_from_the_lidar(tmp_path: Path) -> None:
-    simulation = simulated(written(tmp_path))
+def test_geoms_of_the_robot_hide_nothing_from_the_lidar(tmp_path: Path) -> None:
+    simulation = simulated(robot_file(tmp_path))
     ranges = simulation.scan()
     assert ranges.min() > 2.5  # the walls are 3 m away
 
 
-def test_its_outline_is_the_footprint_of_the_file(tmp_path: Path) -> None:
-    footprint = simulated(written(tmp_path)).truth.footprint
+def test_the_outline_of_the_model_is_the_footprint_of_the_file(tmp_path: Path) -> None:
+    footprint = simulated(robot_file(tmp_path)).truth.footprint
     edges = footprint.front, footprint.rear, footprint.half_width
     assert edges == pytest.approx((0.15, -0.25, 0.2))
 
 
-def test_a_lidar_without_a_site_is_put_where_the_file_says(tmp_path: Path) -> None:
-    file = written(tmp_path, ("    lidar: mast\n", "  lidar_height: 0.3\n"))
+def test_a_lidar_without_a_site_is_placed_by_the_robot_file(tmp_path: Path) -> None:
+    file = robot_file(tmp_path, ("    lidar: mast\n", "  lidar_height: 0.3\n"))
     simulation = simulated(file)
     site = simulation.data.site("robot/lidar").xpos.tolist()
     assert site == pytest.approx((-0.05, 0.0, 0.3), abs=0.01)
 
 
-def test_a_body_may_carry_the_lidar(tmp_path: Path) -> None:
-    simulated(written(tmp_path, ("lidar: mast", "lidar: arm")))
+def test_the_lidar_may_be_placed_by_a_body_of_the_model(tmp_path: Path) -> None:
+    simulated(robot_file(tmp_path, ("lidar: mast", "lidar: arm")))
 
 
-def test_all_that_is_missing_is_said_in_one_message_with_the_line_of_the_file(
+def test_all_missing_parts_are_reported_in_one_message_with_the_line(
     tmp_path: Path,
 ) -> None:
     text = refusal(
-        written(
+        robot_file(
             tmp_path,
             ("wheel_left: joint_left", "wheel_left: joint_lift"),
             ("wheel_right: joint_right", "wheel_right: {joint: joint_right, actuator: rigth}"),
@@ -213,7 +213,7 @@ def test_all_that_is_missing_is_said_in_one_message_with_the_line_of_the_file(
 def test_each_mistake_in_the_table_is_refused_with_its_line(
     tmp_path: Path, old: str, new: str, line: int, reason: str
 ) -> None:
-    text = refusal(written(tmp_path, (old, new)))
+    text = refusal(robot_file(tmp_path, (old, new)))
     assert text.startswith(f"{tmp_path}/robot.yaml:{line}: ")
     assert any(one in text for one in reason.split("|")), text
 
@@ -234,7 +234,7 @@ def test_a_model_that_cannot_be_driven_is_refused_in_one_line(
     tmp_path: Path, old: str, new: str, problem: str
 ) -> None:
     assert old in MODEL
-    text = refusal(written(tmp_path, model=MODEL.replace(old, new)))
+    text = refusal(robot_file(tmp_path, model=MODEL.replace(old, new)))
     assert problem in text
     assert text.startswith(f"{tmp_path}/robot.yaml:")
 
@@ -248,27 +248,27 @@ def test_a_model_that_cannot_be_driven_is_refused_in_one_line(
         ("x: -0.05}", "x: -0.05, yaw: 1.57}", "lidar: yaw is 0.000 rad here, and 1.570 rad"),
     ],
 )
-def test_geometry_that_contradicts_the_model_is_a_warning_with_both_numbers(
+def test_a_contradiction_between_file_and_model_is_a_warning_with_both_numbers(
     tmp_path: Path, caplog: pytest.LogCaptureFixture, old: str, new: str, warning: str
 ) -> None:
     with caplog.at_level(logging.WARNING):
-        simulated(written(tmp_path, (old, new)))
+        simulated(robot_file(tmp_path, (old, new)))
     (text,) = caplog.messages
     assert text == f"{tmp_path}/cart.xml: {warning} in the robot's file"
 
 
-def test_an_outline_that_contradicts_the_file_is_a_warning(
+def test_an_outline_unlike_the_footprint_is_a_warning(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     box = 'pos="-.05 0 .12" size=".18 .14 .06" mass="0"'
     wide = MODEL.replace(box, box.replace("-.05 0", "-.05 .1"))
     with caplog.at_level(logging.WARNING):
-        simulated(written(tmp_path, model=wide))
+        simulated(robot_file(tmp_path, model=wide))
     left = "the left side of the footprint is 0.240 m here, and 0.200 m in the robot's file"
     assert caplog.messages == [f"{tmp_path}/cart.xml: {left}"]
 
 
-def test_a_servo_that_is_too_slow_for_the_file_is_a_warning(
+def test_an_actuator_too_slow_for_the_speed_limit_is_a_warning(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     slow = MODEL.replace(
@@ -276,13 +276,13 @@ def test_a_servo_that_is_too_slow_for_the_file_is_a_warning(
         '<velocity name="left" joint="joint_left" kv="1" ctrlrange="-5 5"/>',
     )
     with caplog.at_level(logging.WARNING):
-        simulated(written(tmp_path, model=slow))
+        simulated(robot_file(tmp_path, model=slow))
     (text,) = caplog.messages
     assert "the actuator of wheel_left ends at 5 rad/s" in text
     assert "ask for 13.3 rad/s" in text
 
 
-async def test_meshes_and_included_files_lie_beside_the_model(tmp_path: Path) -> None:
+async def test_meshes_and_included_files_are_found_beside_the_model(tmp_path: Path) -> None:
     assets = tmp_path / "assets"
     assets.mkdir()
     corners = "\n".join(f"v {x} {y} {z}" for x in (0, 1) for y in (0, 1) for z in (0, 1))
@@ -296,30 +296,30 @@ async def test_meshes_and_included_files_lie_beside_the_model(tmp_path: Path) ->
     model = model.replace(
         '<site name="mast"', '<geom class="visual" type="mesh" mesh="cube"/><site name="mast"'
     )
-    _, driver = make_driver(written(tmp_path, model=model), Run(folder=Path()))
+    _, driver = make_driver(robot_file(tmp_path, model=model), Run(folder=Path()))
     assert isinstance(driver, MujocoDriver)
     await driver.close()
 
 
-ATTACHES = {"lekiwi"}  # a part of its model has its names in another file
+ATTACHES = {"lekiwi"}  # some names of its model are in another file
 SIMULATED = [n for n in robot_files() if (load_robot(n).sim or {}).get("driver") == "mujoco"]
 BODIES = [name for name in SIMULATED if name not in ATTACHES]
 
 
 @pytest.mark.parametrize("name", BODIES)
-def test_every_body_drives_the_same_by_other_names(name: str, tmp_path: Path) -> None:
-    """Each part of the model has another name, and the table says which."""
+def test_every_body_drives_the_same_with_renamed_parts(name: str, tmp_path: Path) -> None:
+    """Rename each part of the model, and list the new names in the table."""
     robot, _, options, folder = load_link(name, Run(folder=Path()))
     assert isinstance(options, MujocoOptions)
     body = sim_body(robot, options, Run(folder=folder))
     parts = {name for kind, name in body.parts() if kind == "actuator"}
     joints = {name for kind, name in body.parts() if kind == "joint"}
     sensors = {name for kind, name in body.parts() if kind == "sensor"}
-    named = {"base", "free", "lidar", "gyro", "accelerometer", "attitude"}
-    words = sorted(parts | joints | sensors | named, key=len, reverse=True)
+    base_names = {"base", "free", "lidar", "gyro", "accelerometer", "attitude"}
+    words = sorted(parts | joints | sensors | base_names, key=len, reverse=True)
     other = re.sub(rf'"({"|".join(words)})"', r'"their_\1"', body.model)
     assert other != body.model
-    own = named & set(re.findall(r'"(\w+)"', body.model))
+    own = base_names & set(re.findall(r'"(\w+)"', body.model))
     table = {key: f"their_{key}" for key in own - {"free"}}
     table |= {key: f"their_{key}" for key in sensors}
     table |= {key: f"their_{f'{key}_joint' if f'{key}_joint' in joints else key}" for key in parts}

@@ -1,4 +1,4 @@
-"""A package may bring a perception step of its own: entry point `gigabrain.perceptors`."""
+"""A package may bring its own perception step: entry point `gigabrain.perceptors`."""
 
 import functools
 import math
@@ -76,7 +76,7 @@ def package(site: Path) -> None:
 
 
 @pytest.mark.usefixtures("package")
-def test_it_is_found_by_its_name_and_a_broken_one_names_its_package() -> None:
+def test_a_perceptor_is_found_by_name_and_a_broken_one_names_its_package() -> None:
     assert perceptors.load("people").__name__ == "People"
     with pytest.raises(UnknownName, match=r"no perceptor 'peple'; did you mean 'people'\?"):
         perceptors.check_known("peple")
@@ -84,16 +84,16 @@ def test_it_is_found_by_its_name_and_a_broken_one_names_its_package() -> None:
         perceptors.load("ghosts")
 
 
-class Bench:
-    """Sees a person wherever the nearest hit ahead is, and remembers what it was given."""
+class RecordingPerceptor:
+    """Reports a person at the hit straight ahead, and records its inputs."""
 
     Config = Struct
 
     def __init__(self) -> None:
-        self.given: list[PerceptorInputs] = []
+        self.inputs_log: list[PerceptorInputs] = []
 
     def step(self, inputs: PerceptorInputs) -> Sequence[DetectedObject]:
-        self.given.append(inputs)
+        self.inputs_log.append(inputs)
         ahead = float(inputs.scan.ranges_m[0])
         return (person(inputs.pose.x + ahead, inputs.pose.y),)
 
@@ -107,9 +107,9 @@ def world(tick: int) -> WorldModel:
 
 
 @pytest.mark.parametrize("order", ["scan world state", "state scan world", "scan state world"])
-async def test_it_gets_scan_world_and_pose_of_one_tick_in_whatever_order(order: str) -> None:
-    """The body is at x = tick metres, and the person always 2 m ahead of it."""
-    perceptor = Bench()
+async def test_it_gets_scan_world_and_pose_of_one_tick_in_any_order_of_arrival(order: str) -> None:
+    """The body is at x = tick metres; the person is always 2 m ahead of it."""
+    perceptor = RecordingPerceptor()
     async with NodeBench(functools.partial(perceptors.run, perceptor)) as bench:
         await bench.ready()
         bench.send(BODY, body())
@@ -125,12 +125,12 @@ async def test_it_gets_scan_world_and_pose_of_one_tick_in_whatever_order(order: 
                 await bench.clock.advance(0)
         sent = [msgspec.msgpack.decode(data, type=Objects)
                 for key, data in bench.network.sent if key == "robot/perceived/node"]  # fmt: skip
-    assert [(one.scan.basis, one.world.basis) for one in perceptor.given] == [(6, 6), (11, 11)]
+    assert [(one.scan.basis, one.world.basis) for one in perceptor.inputs_log] == [(6, 6), (11, 11)]
     assert [(one.basis, one.objects[0].x) for one in sent] == [(6, 8.0), (11, 13.0)]
 
 
-async def test_a_world_without_its_scan_is_left_out() -> None:
-    perceptor = Bench()
+async def test_a_world_without_its_scan_is_skipped() -> None:
+    perceptor = RecordingPerceptor()
     async with NodeBench(functools.partial(perceptors.run, perceptor)) as bench:
         await bench.ready()
         bench.send(BODY, body())
@@ -138,13 +138,13 @@ async def test_a_world_without_its_scan_is_left_out() -> None:
         bench.send(SCAN, scan(open_space(deg_0=2.0), 1))
         bench.send(WORLD, world(6))
         await bench.clock.advance(0)
-    assert perceptor.given == []
+    assert perceptor.inputs_log == []
 
 
-def test_what_is_to_be_avoided_joins_the_obstacles_where_it_will_be() -> None:
+def test_objects_to_avoid_join_the_obstacles_at_their_predicted_place() -> None:
     moving = person(2.0, 1.0, velocity_x=-0.5, avoid=True)
     found = {"people": Objects(objects=(moving, person(9.0, 9.0)), basis=50)}
-    here = Pose(x=1.9, y=0.0, yaw=math.pi / 2)  # in front of it, and looking at it
+    here = Pose(x=1.9, y=0.0, yaw=math.pi / 2)  # faces the person
     merged = with_objects(world(60), here, found)
     (one,) = merged.obstacles
     assert (one.x, one.y, one.radius) == (pytest.approx(1.9), 1.0, 0.25)
@@ -155,8 +155,8 @@ def test_what_is_to_be_avoided_joins_the_obstacles_where_it_will_be() -> None:
     assert with_objects(world(60), here, {}) == world(60)
 
 
-class Seeing:
-    """Stands, and remembers what perceptors have found."""
+class RecordingBehaviour:
+    """Stands still, and records the objects from perceptors."""
 
     Config = Struct
     PARAMS: dict[str, str] = {}  # noqa: RUF012
@@ -171,40 +171,38 @@ class Seeing:
         return Intent(twist=Velocity(), behaviour="seeing", reason="looking"), StepOutcome()
 
 
-def tell(plane: Plane, *objects: DetectedObject) -> None:
-    """Publish what a perceptor finds in the newest scan, in the odometry's frame."""
+def publish_objects(plane: Plane, *objects: DetectedObject) -> None:
+    """Publish objects as a perceptor does for the newest scan, in the odometry's frame."""
     x, y, _ = plane.start
-    there = tuple(msgspec.structs.replace(one, x=one.x - x, y=one.y - y) for one in objects)
-    found = Objects(objects=there, boot=BOOT, tick=plane.tick, basis=plane.tick)
+    in_odometry = tuple(msgspec.structs.replace(one, x=one.x - x, y=one.y - y) for one in objects)
+    found = Objects(objects=in_odometry, boot=BOOT, tick=plane.tick, basis=plane.tick)
     plane.bench.network.deliver(KEY, codec.encode(found))
 
 
-async def test_a_behaviour_gets_what_is_found_until_its_perceptor_falls_silent(
+async def test_a_behaviour_gets_objects_until_their_perceptor_falls_silent(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setitem(behaviours.SHIPPED, "seeing", Seeing)
-    Seeing.seen.clear()
+    monkeypatch.setitem(behaviours.SHIPPED, "seeing", RecordingBehaviour)
+    RecordingBehaviour.seen.clear()
     async with Plane(drawn(HALL), config=DecisionConfig(behaviour="seeing")) as plane:
         await plane.go(0.2)
-        tell(plane, person(3.0, 1.0))
+        publish_objects(plane, person(3.0, 1.0))
         await plane.go(0.2)
-        assert [one.label for one in Seeing.seen[-1]["people"].objects] == ["person"]
+        assert [one.label for one in RecordingBehaviour.seen[-1]["people"].objects] == ["person"]
         await plane.go(0.6)
-        assert Seeing.seen[-1] == {}
-    assert Seeing.seen[0] == {}
+        assert RecordingBehaviour.seen[-1] == {}
+    assert RecordingBehaviour.seen[0] == {}
 
 
 @pytest.mark.parametrize(("avoid", "clear"), [(False, False), (True, True)])
-async def test_the_planner_keeps_clear_of_what_is_to_be_avoided_and_of_nothing_else(
-    avoid: bool, clear: bool
-) -> None:
-    """No beam sees it: a glass table, half way to the goal."""
+async def test_the_planner_keeps_clear_only_of_objects_to_avoid(avoid: bool, clear: bool) -> None:
+    """The object is half way to the goal, and no beam hits it."""
     closest = math.inf
     async with Plane(drawn(HALL), at=(1.0, 1.0, 0.0)) as plane:
         await plane.go(0.2)
         await plane.ask(GOAL, GoalRequest(x=4.0, y=1.0, source="ann"))
         while not plane.status.done and plane.tick < 3000:
-            tell(plane, person(2.5, 1.0, avoid=avoid))
+            publish_objects(plane, person(2.5, 1.0, avoid=avoid))
             await plane.go(0.1)
             closest = min(closest, math.hypot(plane.x - 2.5, plane.y - 1.0))
         assert plane.status.done[0].state == "succeeded"

@@ -17,12 +17,12 @@ from tests.node.ros2_robot import TYPES, RosNode, gateway_on
 from tests.node.test_ros2_hostile import mutated
 from tests.node.test_ros2_navigation import ACTION, Brain, Client, ros_goal
 
-ASKS = {
+SERVICES = {
     "send_goal": f"{ACTION}_SendGoal",
     "get_result": f"{ACTION}_GetResult",
     "cancel_goal": "action_msgs/srv/CancelGoal",
 }
-READS = {
+TOPICS = {
     "tf": "tf2_msgs/msg/TFMessage",
     "battery_state": "sensor_msgs/msg/BatteryState",
     "navigate_to_pose/_action/feedback": f"{ACTION}_FeedbackMessage",
@@ -36,27 +36,27 @@ def goal_id(number):
 
 
 class Adapter:
-    """The adapter's side: plain keys, and no more of ROS than the types."""
+    """The adapter's side: plain Zenoh keys, and ROS types only for the payloads."""
 
     def __init__(self, brain, gateway_bus, node):
         self.brain, self.gateway_bus, self.node = brain, gateway_bus, node
-        self.transport, self.received = brain.net.network.transport(), {key: [] for key in READS}
+        self.transport, self.received = brain.net.network.transport(), {key: [] for key in TOPICS}
 
     def read(self, key):
-        """Subscribe; returns the function that ends it."""
-        took = self.received[key]
+        """Subscribe; return a function that unsubscribes."""
+        received = self.received[key]
         return self.transport.subscribe(
-            key, lambda _, payload: took.append(TYPES.decode(READS[key], payload)), 1
+            key, lambda _, payload: received.append(TYPES.decode(TOPICS[key], payload)), 1
         )
 
     async def post(self, name, payload):
-        """Return what is answered, CDR or a text, while no time passes but the loop's."""
+        """Query a service; return its reply, CDR or an error text. Fake time stands still."""
         key = f"navigate_to_pose/_action/{name}"
         (reply,) = await self.transport.query(key, payload, "", 1.0, "data")
         return reply
 
     async def ask(self, name, **fields):
-        kind = ASKS[name]
+        kind = SERVICES[name]
         request = TYPES.encode(f"{kind}_Request", TYPES.make(f"{kind}_Request", **fields))
         reply = TYPES.decode(f"{kind}_Response", await self.post(name, request))
         await self.brain.settle()
@@ -82,7 +82,7 @@ async def adapter():
         yield Adapter(brain, bus, RosNode(ros, brain.net.clock))
 
 
-async def test_a_goal_is_a_task_and_its_state_is_answered_at_once():
+async def test_a_goal_becomes_a_task_and_get_result_answers_at_once():
     async with adapter() as rmf:
         rmf.read("navigate_to_pose/_action/feedback")
         assert await rmf.send(1)
@@ -93,15 +93,15 @@ async def test_a_goal_is_a_task_and_its_state_is_answered_at_once():
         )
         (message,) = rmf.received["navigate_to_pose/_action/feedback"]
         assert message.goal_id.uuid.tolist() == [1] * 16
-        told = message.feedback
-        assert (told.distance_remaining, told.estimated_time_remaining.sec) == (2.25, 9)
-        assert told.current_pose.header.frame_id == "map"
+        feedback = message.feedback
+        assert (feedback.distance_remaining, feedback.estimated_time_remaining.sec) == (2.25, 9)
+        assert feedback.current_pose.header.frame_id == "map"
         assert await rmf.status(1) == 2
         await rmf.brain.publish_task("succeeded")
         assert await rmf.status(1) == 4
 
 
-async def test_the_zero_id_cancels_every_goal_also_those_of_ros():
+async def test_the_zero_id_cancels_all_goals_including_those_of_ros():
     async with adapter() as rmf:
         await rmf.send(1)
         assert await rmf.cancel(EVERY_GOAL) == 0
@@ -113,7 +113,7 @@ async def test_the_zero_id_cancels_every_goal_also_those_of_ros():
         assert await ros.result(2) == (5, 0)
 
 
-async def test_a_goal_that_fails_or_is_not_known_has_such_a_state():
+async def test_failed_and_unknown_goals_have_their_own_states():
     async with adapter() as rmf:
         await rmf.send(1)
         await rmf.brain.publish_task("failed", reason="gave up")
@@ -138,22 +138,22 @@ async def test_goals_of_ros_and_of_open_rmf_preempt_each_other():
         ]  # fmt: skip
 
 
-async def test_states_of_goals_are_published_as_they_change():
+async def test_goal_states_are_published_on_change():
     async with adapter() as rmf:
         rmf.read("navigate_to_pose/_action/status")
         await rmf.send(1)
-        await until(lambda: told(rmf) == [[2]], "it is carried out")
+        await until(lambda: published_states(rmf) == [[2]], "it is carried out")
         await rmf.brain.publish_task("succeeded")
-        await until(lambda: told(rmf) == [[2], [4]], "its end")
+        await until(lambda: published_states(rmf) == [[2], [4]], "its end")
 
 
-def told(rmf):
-    """Return the states on the status topic, of all goals each time."""
+def published_states(rmf):
+    """Return the states of all goals in each message on the status topic."""
     messages = rmf.received["navigate_to_pose/_action/status"]
     return [[one.status for one in message.status_list] for message in messages]
 
 
-async def states(rmf, count, **about):
+async def publish_states(rmf, count, **about):
     for _ in range(count):
         rmf.brain.tick += 1
         rmf.brain.bus.time.tick = rmf.brain.tick
@@ -165,7 +165,7 @@ async def test_transforms_lead_from_the_map_to_the_footprint():
     async with adapter() as rmf:
         await rmf.brain.located(x=2.0, y=1.0)
         rmf.read("tf")
-        await states(rmf, 3, pose=(0.5, 0.0, 0.25))
+        await publish_states(rmf, 3, pose=(0.5, 0.0, 0.25))
         assert len(rmf.received["tf"]) == 3
         frames = {one.child_frame_id: one for one in rmf.received["tf"][-1].transforms}
         assert frames["odom"].header.frame_id == "map"
@@ -177,10 +177,10 @@ async def test_transforms_lead_from_the_map_to_the_footprint():
         assert 2 * math.asin(moved.rotation.z) == pytest.approx(0.25)
 
 
-async def test_the_battery_comes_once_a_second_from_0_to_1_and_not_from_a_body_without():
+async def test_a_battery_is_published_once_a_second_as_0_to_1():
     async with adapter() as rmf:
         rmf.read("battery_state")
-        await states(rmf, 100, battery=62.5)
+        await publish_states(rmf, 100, battery=62.5)
         found = [one.percentage for one in rmf.received["battery_state"]]
         assert found == [0.625, 0.625]
         rmf.brain.bus.publish(STATE, replace(samples.state(rmf.brain.tick + 1), battery=None))
@@ -188,22 +188,22 @@ async def test_the_battery_comes_once_a_second_from_0_to_1_and_not_from_a_body_w
         assert len(rmf.received["battery_state"]) == 2
 
 
-async def test_what_nobody_reads_is_not_encoded():
+async def test_topics_without_subscribers_are_not_encoded():
     async with adapter() as rmf:
         encoded = rmf.gateway_bus.counters
-        await states(rmf, 10)
+        await publish_states(rmf, 10)
         assert encoded["published"] == 0
         end = rmf.read("tf")
-        await states(rmf, 10)
+        await publish_states(rmf, 10)
         assert encoded["published"] == 10
         end()
-        await states(rmf, 10)
+        await publish_states(rmf, 10)
         assert encoded["published"] == 10
         keys = {key for key, _ in rmf.brain.net.network.sent if "robot/" not in key}
         assert keys == {"tf", "navigate_to_pose/_action/status"}
 
 
-@pytest.mark.parametrize("name", ASKS)
+@pytest.mark.parametrize("name", SERVICES)
 @pytest.mark.parametrize(
     ("payload", "reason"),
     [
@@ -212,25 +212,25 @@ async def test_what_nobody_reads_is_not_encoded():
         (b"\x00\x01\x00\x00" + bytes(MAX_COMMAND), "expected at most 65536"),
     ],
 )
-async def test_a_bad_request_is_refused_counted_and_said_once(name, payload, reason, caplog):
+async def test_a_bad_request_is_refused_counted_and_logged_once(name, payload, reason, caplog):
     async with adapter() as rmf:
         for _ in range(3):
             assert reason in await rmf.post(name, payload)
         await rmf.brain.net.clock.advance(10**9)
         assert rmf.gateway_bus.counters["free_fleet_refused"] == 3
-        said = [one for one in caplog.messages if "refused a request of" in one]
-        assert len(said) == 1
-        assert f"navigate_to_pose/_action/{name}" in said[0]
+        logged = [one for one in caplog.messages if "refused a request of" in one]
+        assert len(logged) == 1
+        assert f"navigate_to_pose/_action/{name}" in logged[0]
         assert rmf.brain.requests == []
         assert await rmf.send(1)
 
 
 @pytest.mark.parametrize("seed", range(3))
-async def test_mutated_requests_end_nothing_and_move_nothing(seed):
+async def test_mutated_requests_neither_crash_the_gateway_nor_move_the_robot(seed):
     dice = random.Random(seed)
     async with adapter() as rmf:
         rmf.brain.bus.publish(BODY, samples.body())
-        for name, kind in ASKS.items():
+        for name, kind in SERVICES.items():
             payload = TYPES.encode(f"{kind}_Request", TYPES.make(f"{kind}_Request"))
             for _ in range(200):
                 await rmf.post(name, mutated(dice, payload))
@@ -241,7 +241,7 @@ async def test_mutated_requests_end_nothing_and_move_nothing(seed):
         assert await rmf.status(77) == 2
 
 
-async def test_without_the_setting_there_is_nothing_of_it():
+async def test_without_its_setting_free_fleet_is_not_served():
     brain = Brain()
     async with gateway_on(brain.net.network, brain.net.clock):
         await brain.located()

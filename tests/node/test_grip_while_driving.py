@@ -22,7 +22,7 @@ LEKIWI = load_robot("lekiwi")
 assert LEKIWI.arm
 HOME = LEKIWI.arm.home
 GRIPPER = LEKIWI.joints[-1]
-WIDTH = 0.8  # [rad], position where a thing stops the gripper
+WIDTH = 0.8  # [rad], position at which the held thing stops the gripper
 GRIP = WIDTH - STILL[1] * (GRIPPER.upper - GRIPPER.lower)
 
 
@@ -39,7 +39,7 @@ class Carrier(Plane):
 
     @property
     def lag(self) -> float:
-        """The lag of the gripper, as a share of its range."""
+        """Return the lag of the gripper behind its target, as a share of its range."""
         return (self.width - self.sent[GRIPPER.name]) / (GRIPPER.upper - GRIPPER.lower)
 
     def _with_joints(self, topic: Topic[Any], message: Any) -> None:
@@ -118,8 +118,8 @@ async def restart(plane: Carrier, folder: Path) -> None:
 
 
 async def drive(plane: Carrier, way: float) -> None:
-    """Let time pass until the base drove so far [m]."""
+    """Let time pass until the base has driven `way` metres in all."""
     while plane.travelled < way:
         await plane.go(0.1)
-        await asyncio.sleep(0.01)  # for the worker thread that loads the arm's kernels and plans
+        await asyncio.sleep(0.01)  # a worker thread loads the arm's kernels and plans
     assert plane.status.current

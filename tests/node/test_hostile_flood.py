@@ -1,4 +1,4 @@
-"""Hostile payloads on every key of a whole robot in memory: its wheels do not notice."""
+"""Hostile payloads on every key of a whole robot in memory do not change its speed."""
 
 import itertools
 from collections.abc import Iterator
@@ -15,7 +15,7 @@ from gigabrain_zenoh.qa.faults.hostile import codec_of, hostile_payloads, hostil
 from gigabrain_zenoh.testing.in_memory import RobotInMemory
 
 TICKS = 200
-PER_TICK = 100  # 20000 payloads in all
+PER_TICK = 100  # 20000 payloads in total
 
 
 async def speeds(folder: Path, resume: Resume, per_tick: int) -> list[float]:
@@ -30,7 +30,7 @@ async def speeds(folder: Path, resume: Resume, per_tick: int) -> list[float]:
 
 
 def flood(seed: int) -> Iterator[tuple[str, bytes]]:
-    """Without end: one for each key in turn, mostly for the key that the body obeys."""
+    """Yield endless payloads: one for each key in turn, and one for CMD_VEL before each."""
     endless = [(topic.at("x"), hostile_payloads(topic.type, seed)) for topic in TOPICS]
     commands = hostile_payloads(CmdVel, seed + 1)
     while True:
@@ -39,20 +39,20 @@ def flood(seed: int) -> Iterator[tuple[str, bytes]]:
             yield key, next(payloads)
 
 
-async def test_a_driving_robot_drives_on_as_if_nothing_had_come(tmp_path: Path) -> None:
+async def test_hostile_payloads_do_not_change_the_speed_of_a_driving_robot(tmp_path: Path) -> None:
     calm = await speeds(tmp_path / "calm", "auto", 0)
     assert max(calm) > 0.25
     assert await speeds(tmp_path / "flooded", "auto", PER_TICK) == calm
 
 
-async def test_a_robot_that_nobody_has_enabled_stands_still(tmp_path: Path) -> None:
+async def test_hostile_payloads_do_not_move_a_robot_that_is_not_enabled(tmp_path: Path) -> None:
     assert set(await speeds(tmp_path, "manual", PER_TICK)) == {0.0}
 
 
-async def test_values_that_are_valid_all_the_same_move_nothing(tmp_path: Path) -> None:
-    """-0.0, an empty name, 1.5 m/s: they decode, but echo no tick of this robot.
+async def test_valid_commands_without_the_boot_of_the_robot_are_refused(tmp_path: Path) -> None:
+    """Values such as -0.0, an empty name or 1.5 m/s decode, but echo no tick of this robot.
 
-    In the name of control they make safety think that control has fallen silent: that stops.
+    Those in the name of control make safety see control as silent, so it stops the robot.
     """
     values, valid = hostile_values(CmdVel, 5), 0
     async with RobotInMemory(tmp_path, resume="auto") as robot:
@@ -88,7 +88,7 @@ async def test_hostile_requests_are_refused_with_a_reason(
         await robot.go(30)
         stranger = robot.network.transport()
         for payload in itertools.islice(hostile_payloads(service.request, 7), 500):
-            if not payload:  # an empty request has nothing but defaults
+            if not payload:  # an empty request is valid: all defaults
                 continue
             replies = await stranger.query(service.key, payload, "", 60.0, service.priority)
             assert replies

@@ -1,4 +1,4 @@
-"""Each joint of a stretched arm follows, with a load and with backlash, by the physics."""
+"""In the physics, each joint of a stretched arm follows, with a load and with backlash."""
 
 import pytest
 
@@ -7,7 +7,7 @@ from gigabrain_zenoh.qa.bench.joints import measure_joints
 
 
 @pytest.mark.parametrize("body", ["so101", pytest.param("piper", marks=pytest.mark.slow)])
-def test_joints_follow_a_sine_within_a_degree_and_hardly_overshoot_a_step(body: str) -> None:
+def test_joints_follow_a_sine_within_a_degree_and_overshoot_a_step_by_2_percent(body: str) -> None:
     result = measure_joints(body, 0.1, 1.0, lambda _: None)
     assert len(result.joints) == {"so101": 5, "piper": 6}[body]
     for joint in result.joints:

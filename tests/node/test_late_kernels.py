@@ -33,7 +33,7 @@ class Compiler:
 
     def __init__(self) -> None:
         self.may_end, self.began = asyncio.Event(), 0
-        self.kills = 0  # number of next children to be killed
+        self.kills = 0  # how many of the next children get killed
         self.compiled: list[str] = []
         self._loaded, self._loop = asyncio.Event(), asyncio.get_running_loop()
 
@@ -60,15 +60,15 @@ class Compiler:
 
 @pytest.fixture
 async def compiler(monkeypatch: pytest.MonkeyPatch) -> Compiler:
-    made = Compiler()
-    monkeypatch.setattr(precompile, "_is_missing", lambda warm_up: warm_up not in made.compiled)
-    monkeypatch.setattr(precompile, "compile_in_child", made.compile)
-    monkeypatch.setattr(precompile, "_call", made.load)
+    compiler = Compiler()
+    monkeypatch.setattr(precompile, "_is_missing", lambda warm_up: warm_up not in compiler.compiled)
+    monkeypatch.setattr(precompile, "compile_in_child", compiler.compile)
+    monkeypatch.setattr(precompile, "_call", compiler.load)
     monkeypatch.setattr(in_memory, "PatientJournal", InputLogger)
-    return made
+    return compiler
 
 
-async def test_it_roams_without_a_map_and_then_explores_by_itself(compiler: Compiler) -> None:
+async def test_it_roams_while_kernels_compile_and_then_explores(compiler: Compiler) -> None:
     async with Plane(CELLS, config=EXPLORES) as plane:
         plane.maps = False
         await plane.go(20.0)
@@ -80,7 +80,7 @@ async def test_it_roams_without_a_map_and_then_explores_by_itself(compiler: Comp
         assert plane.status.current is None
         await compiler.end()
         await plane.go(1.0)
-        assert plane.intent.behaviour == "avoid"  # until perception also has a map
+        assert plane.intent.behaviour == "avoid"  # it needs a map from perception too
         plane.maps = True
         await plane.go(3.0)
         assert plane.intent.behaviour == "navigate"
@@ -88,7 +88,7 @@ async def test_it_roams_without_a_map_and_then_explores_by_itself(compiler: Comp
         assert plane.status.current.label == "roaming"
 
 
-async def test_a_task_ends_the_roaming_and_waits(compiler: Compiler) -> None:
+async def test_a_new_task_ends_the_roaming_and_waits_for_the_kernels(compiler: Compiler) -> None:
     async with Plane(CELLS, config=EXPLORES) as plane:
         await plane.go(2.0)
         reply = await plane.ask_at_once(GOAL, GoalRequest(x=4.0, y=0.8))
@@ -101,7 +101,9 @@ async def test_a_task_ends_the_roaming_and_waits(compiler: Compiler) -> None:
         await plane.until("succeeded", seconds=60)
 
 
-async def test_a_robot_that_waits_for_tasks_stands_meanwhile(compiler: Compiler) -> None:
+async def test_a_robot_without_a_start_task_stands_while_kernels_compile(
+    compiler: Compiler,
+) -> None:
     async with Plane(CELLS) as plane:
         await plane.go(5.0)
         assert plane.travelled == 0.0
@@ -110,7 +112,7 @@ async def test_a_robot_that_waits_for_tasks_stands_meanwhile(compiler: Compiler)
         await plane.until("succeeded", seconds=60)
 
 
-async def test_it_does_not_roam_for_ever_without_a_map(compiler: Compiler) -> None:
+async def test_roaming_ends_if_no_map_arrives(compiler: Compiler) -> None:
     async with Plane(CELLS, config=EXPLORES) as plane:
         plane.maps = False
         await plane.go(0.2)
@@ -136,9 +138,11 @@ async def test_in_lock_step_all_kernels_are_compiled_first(compiler: Compiler) -
         await plane.until("succeeded", seconds=60)
 
 
-async def test_perception_sees_at_once_and_maps_later(compiler: Compiler) -> None:
+async def test_perception_publishes_worlds_at_once_and_maps_once_compiled(
+    compiler: Compiler,
+) -> None:
     async with Robot() as robot:
-        robot.say()
+        robot.publish_body()
         robot.drive(scans=3)
         assert len(robot.sent(WORLD)) == 3
         asks = Bus(robot.network.transport(), robot.clock, "test")
@@ -149,7 +153,7 @@ async def test_perception_sees_at_once_and_maps_later(compiler: Compiler) -> Non
         assert len(robot.sent(POSE)) == 5
 
 
-async def test_perception_with_a_saved_map_compiles_first(compiler: Compiler) -> None:
+async def test_perception_with_a_saved_map_waits_for_its_kernels(compiler: Compiler) -> None:
     compiler.may_end.set()
     config = PerceptionConfig(mapping="localize", map="/nowhere/house.yaml")
     with pytest.raises(ConfigError, match="nowhere"):
@@ -158,7 +162,7 @@ async def test_perception_with_a_saved_map_compiles_first(compiler: Compiler) ->
     assert compiler.compiled
 
 
-async def test_a_missing_package_is_named(
+async def test_a_package_missing_for_the_kernels_is_named(
     compiler: Compiler, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def nothing(_: str) -> None:
@@ -174,7 +178,7 @@ async def test_a_missing_package_is_named(
         assert kernels.loaded
 
 
-async def test_a_car_has_its_own_kernels_compiled_once_it_is_known(compiler: Compiler) -> None:
+async def test_kernels_for_cars_are_compiled_when_the_body_is_known(compiler: Compiler) -> None:
     compiler.may_end.set()
     async with Plane(CELLS, config=EXPLORES) as plane:
         plane.description = CAR
@@ -184,20 +188,20 @@ async def test_a_car_has_its_own_kernels_compiled_once_it_is_known(compiler: Com
         assert compiler.compiled == [DRIVE_KERNELS, CAR_KERNELS]
 
 
-async def test_in_lock_step_kernels_of_cars_are_compiled_first_too(compiler: Compiler) -> None:
+async def test_in_lock_step_kernels_for_cars_are_compiled_first_too(compiler: Compiler) -> None:
     compiler.may_end.set()
     kernels = DriveKernels(InputLogger().in_time)
     assert await kernels.load(wait=True)
     assert kernels.loaded(CAR)
 
 
-@pytest.mark.parametrize(("kills", "said"), [(1, ["compiled"]), (2, [])])
-async def test_a_child_that_is_killed_while_it_compiles_is_started_again(
+@pytest.mark.parametrize(("kills", "logged"), [(1, ["compiled"]), (2, [])])
+async def test_a_compiling_child_that_is_killed_is_restarted_once(
     compiler: Compiler,
     monkeypatch: pytest.MonkeyPatch,
     caplog: pytest.LogCaptureFixture,
     kills: int,
-    said: list[str],
+    logged: list[str],
 ) -> None:
     monkeypatch.setattr(precompile, "_call", lambda warm_up: None)
     compiler.kills = kills
@@ -209,4 +213,4 @@ async def test_a_child_that_is_killed_while_it_compiles_is_started_again(
     assert kernels.loaded
     assert compiler.began == 2
     assert caplog.messages.count("compiling was ended by signal 9") == kills
-    assert [text for text in caplog.messages if text == "compiled"] == said
+    assert [text for text in caplog.messages if text == "compiled"] == logged

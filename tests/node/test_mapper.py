@@ -1,4 +1,4 @@
-"""Perception with mapping on: the world first, then the pose of the same scan, and a map."""
+"""Perception with mapping: for each scan a world, then a pose, and at times a map."""
 
 import asyncio
 from pathlib import Path
@@ -30,9 +30,9 @@ def own_maps(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path / "gigabrain" / "maps"
 
 
-async def test_each_scan_gives_a_world_and_then_a_pose_that_rest_on_it() -> None:
+async def test_each_scan_gives_a_world_and_then_a_pose_with_its_basis() -> None:
     async with Robot() as robot:
-        robot.say()
+        robot.publish_body()
         robot.drive(3)
         keys = [key for key, _ in robot.network.sent if key in (WORLD.key, POSE.key)]
         poses = robot.sent(POSE)
@@ -43,38 +43,38 @@ async def test_each_scan_gives_a_world_and_then_a_pose_that_rest_on_it() -> None
     assert len(poses[0].covariance) == 9
 
 
-async def test_a_scan_that_was_quicker_than_the_state_of_its_tick_waits_for_it() -> None:
+async def test_a_scan_that_arrives_before_its_state_waits_for_it() -> None:
     poses = []
-    for quicker in (False, True):
+    for scan_first in (False, True):
         async with Robot() as robot:
-            robot.say()
+            robot.publish_body()
             robot.drive(1)
             robot.tick += 5
             first = robot.scan()
-            late = state(10, pose=(0.04, 0, 0))
-            for send in (1, 0) if quicker else (0, 1):
-                robot.send(*((STATE, late), (SCAN, first))[send])  # type: ignore[misc]
+            state_of_scan = state(10, pose=(0.04, 0, 0))
+            for send in (1, 0) if scan_first else (0, 1):
+                robot.send(*((STATE, state_of_scan), (SCAN, first))[send])  # type: ignore[misc]
             poses.append([(pose.basis, pose.x, pose.y) for pose in robot.sent(POSE)])
     assert poses[0] == poses[1]
     assert [basis for basis, _, _ in poses[0]] == [5, 10]
 
 
-async def test_a_map_that_has_to_be_made_anew_has_its_places_where_the_old_one_had_them() -> None:
+async def test_a_map_started_later_has_the_same_origin() -> None:
     poses = []
-    for dead_until in (0, 100):  # a tick
+    for start_tick in (0, 100):  # when perception starts
         async with Robot() as robot:
-            robot.say()
-            robot.tick = dead_until
-            robot.drive(22 - dead_until // 5)
+            robot.publish_body()
+            robot.tick = start_tick
+            robot.drive(22 - start_tick // 5)
             poses.append(robot.sent(POSE)[-1])
     old, new = poses
     assert (new.x, new.y, new.yaw) == pytest.approx((old.x, old.y, old.yaw), abs=0.02)
     assert old.x == pytest.approx(0.44, abs=0.02)
 
 
-async def test_the_map_comes_once_a_second_and_only_when_it_has_changed() -> None:
+async def test_a_changed_map_is_published_once_a_second() -> None:
     async with Robot() as robot:
-        robot.say()
+        robot.publish_body()
         robot.drive(30)
         maps = robot.sent(MAP)
     assert [occupancy_grid.basis for occupancy_grid in maps] == [5, 55, 105]
@@ -82,48 +82,48 @@ async def test_the_map_comes_once_a_second_and_only_when_it_has_changed() -> Non
     assert last.resolution == 0.05
     cells = np.frombuffer(last.cells, np.int8).reshape(last.height, last.width)
     column, row = int((0.5 - last.origin_x) / 0.05), int((0.0 - last.origin_y) / 0.05)
-    assert 0 <= cells[row, column] < 20  # it has driven there
+    assert 0 <= cells[row, column] < 20  # free: the robot passed it
 
 
-async def test_bad_scans_are_left_out_and_reported_once(caplog: pytest.LogCaptureFixture) -> None:
+async def test_bad_scans_are_skipped_and_reported_once(caplog: pytest.LogCaptureFixture) -> None:
     async with Robot() as robot:
-        robot.say()
+        robot.publish_body()
         robot.drive(2)
         good = robot.scan()
         for _ in range(3):
-            robot.send(SCAN, scan(np.full(200, 2.0), robot.tick))  # of wrong length
+            robot.send(SCAN, scan(np.full(200, 2.0), robot.tick))  # wrong length
         robot.send(SCAN, replace(good, basis=good.basis + 1000))  # from the future
         robot.drive(2)
         assert robot.bus.counters["scans_left_out"] == 4
         poses: list[PoseInMap] = robot.sent(POSE)
     assert [pose.basis for pose in poses] == [5, 10, 15, 20]
-    told = [record.message for record in caplog.records if "not mapped" in record.message]
-    assert told == [
+    logged = [record.message for record in caplog.records if "not mapped" in record.message]
+    assert logged == [
         "scan not mapped: the scan has 200 beams, the body's lidar 360",
         "scan not mapped: its tick 1010 is in the future at tick 15",
     ]
 
 
-@pytest.mark.parametrize(("early", "told"), [(1, 0), (2, 1)])
-async def test_one_scan_may_come_before_its_odometry(
-    early: int, told: int, caplog: pytest.LogCaptureFixture
+@pytest.mark.parametrize(("early", "warnings"), [(1, 0), (2, 1)])
+async def test_one_scan_before_its_odometry_is_skipped_silently(
+    early: int, warnings: int, caplog: pytest.LogCaptureFixture
 ) -> None:
     async with Robot() as robot:
-        robot.say()
+        robot.publish_body()
         robot.tick += 5
         robot.send(STATE, state(robot.tick + 1, pose=(0.0, 0.0, 0.0)))
         for _ in range(early):
             robot.send(SCAN, robot.scan())
         robot.drive(2)
         assert robot.bus.counters["scans_left_out"] == early
-    assert len([r for r in caplog.records if "no odometry for its tick" in r.message]) == told
+    assert len([r for r in caplog.records if "no odometry for its tick" in r.message]) == warnings
 
 
-async def test_a_jump_of_the_odometry_is_reported_and_the_robot_found_again(
+async def test_a_jump_of_the_odometry_is_reported_and_the_robot_relocalized(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     async with Robot() as robot:
-        robot.say()
+        robot.publish_body()
         robot.drive(20)
         robot.tick += 5
         robot.send(STATE, state(robot.tick, pose=(9.0, 9.0, 0)))
@@ -134,20 +134,20 @@ async def test_a_jump_of_the_odometry_is_reported_and_the_robot_found_again(
             robot.tick += 5
             robot.send(STATE, state(robot.tick, pose=(9.0, 9.0, 0)))
             robot.send(SCAN, scan(robot.rooms.ranges(at(3, 2 + 0.004 * base, 90)), robot.tick))
-            await asyncio.sleep(0.005)  # the search runs in a thread beside
+            await asyncio.sleep(0.005)  # the search runs in a thread
         pose = robot.sent(POSE)[-1]
     assert pose.localized
     assert pose.x == pytest.approx(0.004 * (base - 5), abs=0.04)
     assert "not localized: the odometry has jumped" in caplog.messages
 
 
-async def test_after_a_new_start_of_the_driver_the_map_stays_and_the_robot_is_found() -> None:
+async def test_after_a_restart_of_the_driver_the_map_stays_and_the_robot_is_localized() -> None:
     async with Robot() as robot:
-        robot.say()
+        robot.publish_body()
         robot.drive(20, still=True)
         before = robot.sent(MAP)[-1]
         robot.boot, robot.tick = 8, 0
-        robot.say()
+        robot.publish_body()
         robot.drive(1, still=True)
         assert not robot.sent(POSE)[-1].localized
         for _ in range(40):
@@ -162,50 +162,50 @@ async def test_after_a_new_start_of_the_driver_the_map_stays_and_the_robot_is_fo
     assert (pose.x, pose.y) == pytest.approx((0.0, 0.0), abs=0.05)
 
 
-async def test_a_robot_that_is_lost_for_long_is_reported_with_the_command_that_helps(
+async def test_a_robot_lost_for_10_s_is_reported_with_the_command_that_helps(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     async with Robot() as robot:
-        robot.say()
+        robot.publish_body()
         robot.drive(20, still=True)
-        robot.boot, robot.tick = 8, 0  # the driver starts again, and the body is somewhere else
+        robot.boot, robot.tick = 8, 0  # the driver restarts, and the body is elsewhere
         robot.rooms = Rooms(box(-1, -1, 6, 12))
-        robot.say()
+        robot.publish_body()
         robot.drive(99, still=True)
-        early = robot.bus.problems
+        early_problems = robot.bus.problems
         robot.drive(11, still=True)
         assert not robot.sent(POSE)[-1].localized
-        late = robot.bus.problems
+        late_problems = robot.bus.problems
         robot.rooms = Rooms(HOUSE)
         for _ in range(60):
             robot.drive(1, still=True)
             await asyncio.sleep(0.005)
         assert robot.sent(POSE)[-1].localized
-        assert robot.bus.problems == early == ()
-    assert [problem.code for problem in late] == ["not_localized"]
-    assert "`gigabrain pose X Y`" in late[0].remedy
-    assert caplog.messages.count(f"{late[0].text}: {late[0].remedy}") == 1
+        assert robot.bus.problems == early_problems == ()
+    assert [problem.code for problem in late_problems] == ["not_localized"]
+    assert "`gigabrain pose X Y`" in late_problems[0].remedy
+    assert caplog.messages.count(f"{late_problems[0].text}: {late_problems[0].remedy}") == 1
 
 
-async def test_a_map_that_may_grow_no_more_is_reported_once_and_in_the_health(
+async def test_a_full_map_is_logged_once_and_reported_in_the_health(
     caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(occupancy_grid, "MAX_CELLS", 100)
     async with Robot() as robot:
-        robot.say()
+        robot.publish_body()
         robot.drive(30)
         problems = robot.bus.problems
         health = asyncio.ensure_future(publish_health(robot.bus))
         await asyncio.sleep(0)
         health.cancel()
-        told = [data for key, data in robot.network.sent if key == HEALTH.at("node")]
+        health_payloads = [data for key, data in robot.network.sent if key == HEALTH.at("node")]
     assert [problem.code for problem in problems] == ["map_full"]
     assert problems[0].text == "the map is full: 140 m long; what lies beyond is left out"
-    assert Codec(Health, HEALTH.max_bytes).decode(told[-1]).problems == problems
+    assert Codec(Health, HEALTH.max_bytes).decode(health_payloads[-1]).problems == problems
     assert caplog.messages.count(f"{problems[0].text}: map a large site in parts") == 1
 
 
-def test_a_map_for_nothing_is_refused_with_its_line() -> None:
+def test_a_map_without_mapping_is_refused_with_its_line() -> None:
     with pytest.raises(
         ConfigError, match="f:2: map: needs mapping; set `mapping` to slam or localize"
     ):
@@ -213,7 +213,7 @@ def test_a_map_for_nothing_is_refused_with_its_line() -> None:
     assert config.loads('mapping: "off"', PerceptionConfig, "f") == PerceptionConfig()
 
 
-def test_a_map_that_is_missing_or_not_named_is_reported_at_the_start(own_maps: Path) -> None:
+def test_a_missing_empty_or_unnamed_map_is_refused_at_the_start(own_maps: Path) -> None:
     with pytest.raises(ConfigError, match="expected a saved map, as mapping is 'localize'"):
         chart_of(PerceptionConfig(mapping="localize"))
     with pytest.raises(ConfigError, match=r"gone\.yaml: no such file"):
@@ -233,13 +233,13 @@ def test_a_map_that_is_missing_or_not_named_is_reported_at_the_start(own_maps: P
         chart_of(PerceptionConfig(mapping="slam", map="bare"))
 
 
-async def test_a_map_that_does_not_change_is_said_again_every_two_seconds() -> None:
+async def test_an_unchanged_map_is_published_again_every_two_seconds() -> None:
     async with Robot() as robot:
-        robot.say()
+        robot.publish_body()
         robot.drive(20)
         assert (await robot.save("house")).ok
     async with Robot(PerceptionConfig(mapping="localize", map="house")) as robot:
-        robot.say()
+        robot.publish_body()
         robot.drive(45, still=True)
         maps = robot.sent(MAP)
     assert [occupancy_grid.basis for occupancy_grid in maps] == [5, 105, 205]

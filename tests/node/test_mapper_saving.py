@@ -1,4 +1,4 @@
-"""The mapping node saves its map, is found in one again, and goes on with it."""
+"""The mapping node saves its map, localizes the robot in a saved one, and extends it."""
 
 import asyncio
 import functools
@@ -30,9 +30,9 @@ def own_maps(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path / "gigabrain" / "maps"
 
 
-async def test_a_map_is_saved_and_found_in_again(own_maps: Path) -> None:
+async def test_a_map_is_saved_and_the_robot_is_localized_in_it(own_maps: Path) -> None:
     async with Robot() as robot:
-        robot.say()
+        robot.publish_body()
         assert (await robot.save("early")).text.startswith("not saved: where the robot is")
         robot.drive(80)
         reply = await robot.save("house")
@@ -42,7 +42,7 @@ async def test_a_map_is_saved_and_found_in_again(own_maps: Path) -> None:
         assert (await robot.save("house", replace=True)).ok
     found = PerceptionConfig(mapping="localize", map="house")
     async with Robot(found) as robot:
-        robot.say()
+        robot.publish_body()
         for _ in range(40):
             robot.drive(1, still=True)
             await asyncio.sleep(0.005)
@@ -54,10 +54,10 @@ async def test_a_map_is_saved_and_found_in_again(own_maps: Path) -> None:
     assert reply.text == "not saved: perception finds its way in a saved map, it makes none"
 
 
-async def test_zones_are_saved_where_the_saved_map_has_them(
+async def test_zones_are_saved_in_the_frame_of_the_saved_map(
     own_maps: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A save waits for a loop that is being closed, which moves the map."""
+    """A save waits for a loop closure in progress, which moves the map."""
     still = SlamMap.still
 
     def corrected(chart: SlamMap) -> MapSnapshot:
@@ -68,7 +68,7 @@ async def test_zones_are_saved_where_the_saved_map_has_them(
     monkeypatch.setattr(SlamMap, "still", corrected)
     lab = Zone(name="lab", kind="keepout", points=((1.0, 1.0), (2.0, 1.0), (2.0, 2.0)))
     async with Robot() as robot:
-        robot.say()
+        robot.publish_body()
         robot.drive(80)
         assert (await ask(robot, ZONES_CHANGE, ZonesRequest(zone=lab))).ok
         assert (await robot.save("house")).ok
@@ -76,29 +76,31 @@ async def test_zones_are_saved_where_the_saved_map_has_them(
     assert np.array(saved.points) == pytest.approx(np.array(lab.points) + np.array((1.0, 0.0)))
 
 
-async def test_two_who_save_at_once_do_not_write_into_each_others_files(
+async def test_two_saves_at_once_do_not_mix_their_files(
     own_maps: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    real, writing, most = map_file.save, [0], [0]
+    real, writing, max_writing = map_file.save, [0], [0]
 
     def slow(*args: Any, **how: Any) -> None:
         writing[0] += 1
-        most[0] = max(most[0], writing[0])
+        max_writing[0] = max(max_writing[0], writing[0])
         time.sleep(0.05)
         real(*args, **how)
         writing[0] -= 1
 
     monkeypatch.setattr(map_file, "save", slow)
     async with Robot() as robot:
-        robot.say()
+        robot.publish_body()
         robot.drive(80)
         replies = await asyncio.gather(robot.save("house"), robot.save("house"))
-    assert most == [1]
+    assert max_writing == [1]
     assert sorted(reply.ok for reply in replies) == [False, True]
     assert map_file.load_graph(own_maps / "house.yaml")["poses"].ndim == 2
 
 
-async def test_a_map_is_drawn_beside_the_loop(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_a_map_is_drawn_in_another_thread_than_the_loop(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     real, threads = MapSnapshot.to_save, []
 
     def noted(still: MapSnapshot) -> Any:
@@ -107,19 +109,19 @@ async def test_a_map_is_drawn_beside_the_loop(monkeypatch: pytest.MonkeyPatch) -
 
     monkeypatch.setattr(MapSnapshot, "to_save", noted)
     async with Robot() as robot:
-        robot.say()
+        robot.publish_body()
         robot.drive(60)
         assert (await robot.save("house")).ok
     assert threads
     assert threading.current_thread() not in threads
 
 
-async def test_a_replay_of_a_drive_with_a_save_says_the_same_and_saves_nothing(
+async def test_a_replay_with_a_save_publishes_the_same_and_saves_nothing(
     own_maps: Path,
 ) -> None:
     async with Robot() as robot:
         events = record(robot.network, robot.clock)
-        robot.say()
+        robot.publish_body()
         robot.drive(60)
         assert (await robot.save("house")).ok
         robot.drive(20)
@@ -134,39 +136,39 @@ async def test_a_replay_of_a_drive_with_a_save_says_the_same_and_saves_nothing(
     assert not (own_maps / "house.yaml").exists()
 
 
-async def test_a_saved_map_grows_on(own_maps: Path) -> None:
+async def test_a_loaded_map_can_be_extended_and_saved_again(own_maps: Path) -> None:
     async with Robot() as robot:
-        robot.say()
+        robot.publish_body()
         robot.drive(60)
         assert (await robot.save("house")).ok
     size = map_file.load(own_maps / "house.yaml").cells.size
     async with Robot(PerceptionConfig(mapping="slam", map="house")) as robot:
-        robot.say()
+        robot.publish_body()
         for _ in range(40):
             robot.drive(1, still=True)
             await asyncio.sleep(0.005)
         assert robot.sent(POSE)[-1].localized
-        assert (await robot.save("house")).ok  # the same map: nobody else's is lost
+        assert (await robot.save("house")).ok  # may overwrite its own map
     assert map_file.load(own_maps / "house.yaml").cells.size >= size
 
 
-async def test_without_cameras_objects_stay_with_their_own_map_only(own_maps: Path) -> None:
+async def test_without_cameras_objects_are_kept_with_their_own_map_only(own_maps: Path) -> None:
     path = own_maps / "house.yaml"
     async with Robot() as robot:
-        robot.say()
+        robot.publish_body()
         robot.drive(60)
         assert (await robot.save("house")).ok
         known = ObjectFile(tags=(MapTag(id=5, x=0, y=0, z=0.2, yaw=0, size=0.16),))
         object_file.save(path, known)
     async with Robot(PerceptionConfig(mapping="slam", map="house")) as robot:
-        robot.say()
+        robot.publish_body()
         for _ in range(40):
             robot.drive(1, still=True)
             await asyncio.sleep(0.005)
         assert (await robot.save("house")).ok
     assert object_file.load(path) == known
     async with Robot() as robot:
-        robot.say()
+        robot.publish_body()
         robot.drive(60)
         assert (await robot.save("house", replace=True)).ok
     assert object_file.load(path) == ObjectFile()

@@ -1,4 +1,4 @@
-"""Navigating: decision's own node drives a body in a flat world, in fake time."""
+"""Navigation: the decision node drives a body in a flat world, in fake time."""
 
 import math
 from typing import Literal
@@ -19,10 +19,10 @@ from gigabrain_zenoh.testing.samples import BOOT
 from tests.node.plane import ROOM, Plane, drawn
 
 CELLS = drawn(ROOM)
-STANDS = Velocity()
+ZERO_VELOCITY = Velocity()
 
 
-async def test_it_drives_round_a_wall_to_its_goal_and_says_how_far_it_is() -> None:
+async def test_it_drives_round_a_wall_to_its_goal_and_reports_its_progress() -> None:
     async with Plane(CELLS) as plane:
         await plane.go(0.2)
         assert plane.intent.reason == NO_GOAL.reason
@@ -41,7 +41,7 @@ async def test_it_drives_round_a_wall_to_its_goal_and_says_how_far_it_is() -> No
         assert math.hypot(plane.x - 4.0, plane.y - 0.8) < 0.15
         assert plane.status.done[0].reason == "at (4.00, 0.80)"
         await plane.go(0.5)
-        assert (plane.intent.twist, plane.intent.reason) == (STANDS, NO_GOAL.reason)
+        assert (plane.intent.twist, plane.intent.reason) == (ZERO_VELOCITY, NO_GOAL.reason)
 
 
 @pytest.mark.parametrize(
@@ -52,7 +52,7 @@ async def test_it_drives_round_a_wall_to_its_goal_and_says_how_far_it_is() -> No
         (4.7, 1.0, "the goal is too close to something: the body needs "),
     ],
 )
-async def test_a_goal_where_it_cannot_be_is_refused(x: float, y: float, why: str) -> None:
+async def test_an_unreachable_goal_is_refused_with_the_reason(x: float, y: float, why: str) -> None:
     async with Plane(CELLS) as plane:
         await plane.go(0.2)
         reply = await plane.ask(GOAL, GoalRequest(x=x, y=y))
@@ -62,7 +62,7 @@ async def test_a_goal_where_it_cannot_be_is_refused(x: float, y: float, why: str
         assert plane.travelled == 0.0
 
 
-async def test_a_room_without_a_door_is_refused_with_the_nearest_place() -> None:
+async def test_a_goal_behind_a_closed_wall_is_refused_with_the_nearest_point() -> None:
     closed = CELLS.copy()
     closed[:, 50:55] = 100
     async with Plane(closed) as plane:
@@ -73,15 +73,15 @@ async def test_a_room_without_a_door_is_refused_with_the_nearest_place() -> None
 
 
 @pytest.mark.parametrize(
-    ("unknown", "told"),
+    ("unknown", "reply_text"),
     [
         ("allow", "goal-1: on the way, "),
         ("avoid", "goal-1: on the way, "),
         ("forbid", "no way leads to the goal; nearest reachable point is "),
     ],
 )
-async def test_whether_a_way_may_lead_through_the_unknown_is_a_setting(
-    unknown: Literal["allow", "avoid", "forbid"], told: str
+async def test_a_setting_allows_or_forbids_routes_through_unknown_space(
+    unknown: Literal["allow", "avoid", "forbid"], reply_text: str
 ) -> None:
     plane = Plane(
         CELLS, config=DecisionConfig(behaviour="navigate", settings={"unknown_space": unknown})
@@ -90,10 +90,10 @@ async def test_whether_a_way_may_lead_through_the_unknown_is_a_setting(
     async with plane:
         await plane.go(0.2)
         reply = await plane.ask(GOAL, GoalRequest(x=4.0, y=0.8))
-        assert reply.text.startswith(told)
+        assert reply.text.startswith(reply_text)
 
 
-async def test_without_a_map_it_says_what_to_change() -> None:
+async def test_a_goal_without_a_map_is_refused_with_the_setting_to_change() -> None:
     async with Plane(CELLS) as plane:
         plane.maps = False
         await plane.go(0.2)
@@ -107,14 +107,14 @@ async def test_without_a_map_it_says_what_to_change() -> None:
         assert (await plane.ask(MISSION, MissionRequest(mission="do: [{wait: 1}]"))).ok
 
 
-async def test_it_stands_while_it_is_not_sure_where_it_is_and_goes_on_afterwards() -> None:
+async def test_it_stands_while_it_is_not_localized_and_drives_on_afterwards() -> None:
     async with Plane(CELLS) as plane:
         await plane.go(0.2)
         await plane.ask(GOAL, GoalRequest(x=4.0, y=0.8))
         await plane.go(2.0)
         plane.localized = False
         await plane.go(1.5)
-        assert plane.intent.twist == STANDS
+        assert plane.intent.twist == ZERO_VELOCITY
         assert plane.intent.reason == f"waiting: {WaitReason.NOT_LOCALIZED}"
         travelled = plane.travelled
         await plane.go(2.0)
@@ -124,7 +124,7 @@ async def test_it_stands_while_it_is_not_sure_where_it_is_and_goes_on_afterwards
         await plane.until("succeeded", seconds=60)
 
 
-async def test_it_rests_while_the_battery_is_nearly_empty() -> None:
+async def test_it_stands_with_a_reason_while_the_battery_is_nearly_empty() -> None:
     low = Cause(code="battery_return", text="battery at 6 %")
     async with Plane(CELLS) as plane:
         await plane.go(0.2)
@@ -135,10 +135,10 @@ async def test_it_rests_while_the_battery_is_nearly_empty() -> None:
             plane.bench.send(SAFETY, verdict)
             await plane.go(0.1)
         assert plane.intent.reason == "resting: the battery is nearly empty; charge it"
-        assert plane.intent.twist == STANDS
+        assert plane.intent.twist == ZERO_VELOCITY
 
 
-async def test_where_safety_keeps_stopping_it_ahead_it_no_longer_wants_to_advance() -> None:
+async def test_it_stops_pushing_ahead_where_safety_keeps_stopping_it() -> None:
     ahead = Cause(code="zone_ahead", text="obstacle 0.10 m ahead of the body, seen by a camera")
     async with Plane(CELLS) as plane:
         await plane.go(0.2)
@@ -158,28 +158,28 @@ async def test_where_safety_keeps_stopping_it_ahead_it_no_longer_wants_to_advanc
         await plane.until("succeeded", seconds=60)
 
 
-async def test_something_new_in_the_way_is_gone_round() -> None:
+async def test_it_drives_round_a_new_obstacle() -> None:
     wide = drawn("####################\n" + "#..................#\n" * 12 + "####################")
     async with Plane(wide, at=(1.0, 1.6, 0.0)) as plane:
         await plane.go(0.2)
         await plane.ask(GOAL, GoalRequest(x=4.0, y=1.6))
         plane.cells = wide.copy()
-        plane.cells[26:40, 50:56] = 100  # a box across the way; the map learns of it as it is seen
+        plane.cells[26:40, 50:56] = 100  # a new box on the path; it enters the map when seen
         await plane.until("succeeded", seconds=90)
         assert plane.closest > 0.14
         assert not np.array_equal(plane.known, wide)
 
 
-async def test_a_goal_that_turns_out_to_be_too_close_to_something_is_reached_beside_it() -> None:
+async def test_a_goal_found_too_close_to_an_obstacle_is_reached_beside_it() -> None:
     wide = drawn("####################\n" + "#..................#\n" * 12 + "####################")
     async with Plane(wide, at=(1.0, 1.6, 0.0)) as plane:
         await plane.go(0.2)
         assert (await plane.ask(GOAL, GoalRequest(x=4.0, y=1.6))).ok
         plane.cells = wide.copy()
-        plane.cells[:, 83:86] = 100  # from x = 4.15 m on: the body does not fit at the goal
+        plane.cells[:, 83:86] = 100  # a new wall at x = 4.15 m, too close to the goal
         await plane.until("succeeded", seconds=90)
-        told = plane.status.done[0].reason
-        assert " m from the requested goal: the goal is too close to something" in told
+        reason = plane.status.done[0].reason
+        assert " m from the requested goal: the goal is too close to something" in reason
         assert 0.1 < math.hypot(plane.x - 4.0, plane.y - 1.6) < 0.4
         assert plane.closest > 0.1
 
@@ -196,31 +196,31 @@ async def test_the_same_world_gives_the_same_drive() -> None:
     assert places[0] == places[1]
 
 
-class Walked(Plane):
-    """A plane with a person who walks up to the gap beside the wall and stands there."""
+class PersonPlane(Plane):
+    """A plane with a person who walks to the gap beside the wall and stops there."""
 
-    person = 3.8  # [m], along x
+    person = 3.8  # x of the person [m]
 
     def _world(self) -> WorldModel:
-        walks = self.person > 2.7
-        self.person -= 0.05 * walks
+        is_walking = self.person > 2.7
+        self.person -= 0.05 * is_walking
         self.cells = CELLS.copy()
         middle = round(self.person / 0.05)
         self.cells[27:33, middle - 3 : middle + 3] = 100
-        there = Obstacle(
+        person = Obstacle(
             id=3, x=self.person - self.start[0], y=1.5 - self.start[1], radius=0.15,
-            velocity_x=-0.5 * walks,
+            velocity_x=-0.5 * is_walking,
         )  # fmt: skip
         world = super()._world()
-        self.known = CELLS.copy()  # perception leaves out of the map who walks
-        return msgspec.structs.replace(world, obstacles=(there,))
+        self.known = CELLS.copy()  # perception does not map walking people
+        return msgspec.structs.replace(world, obstacles=(person,))
 
 
-async def test_it_gives_way_to_who_has_walked_up_before_it_had_a_goal() -> None:
-    async with Walked(CELLS, (1.9, 1.5, 0.0)) as plane:
+async def test_it_gives_way_to_a_person_who_arrived_before_the_goal() -> None:
+    async with PersonPlane(CELLS, (1.9, 1.5, 0.0)) as plane:
         await plane.go(0.2)
         assert (await plane.ask(MISSION, MissionRequest(mission="do: [{wait: 1}]"))).ok
-        await plane.go(4.0)  # they stand
+        await plane.go(4.0)  # the person stands now
         assert (await plane.ask(GOAL, GoalRequest(x=4.0, y=0.8))).ok
         await plane.go(14.0)
         assert "somebody is in the way" in "\n".join(one.reason for one in plane.intents)

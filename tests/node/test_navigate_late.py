@@ -20,7 +20,7 @@ from gigabrain_zenoh.testing.samples import BOOT, state
 from tests.node.plane import ROOM, Plane, as_map, drawn
 
 CELLS = drawn(ROOM)
-STANDS = Velocity()
+ZERO_VELOCITY = Velocity()
 
 
 async def test_it_stands_while_its_scans_are_too_late() -> None:
@@ -31,13 +31,13 @@ async def test_it_stands_while_its_scans_are_too_late() -> None:
         assert plane.travelled > 0.05
         plane.late_ticks = 11
         await plane.go(0.5)
-        said = set[str]()
+        reasons = set[str]()
         for _ in range(50):
             await plane.go(0.02)
-            assert plane.intent.twist == STANDS
-            said.add(plane.intent.reason)
-        # the older of two such scans is outdated before the next one arrives
-        assert said == {
+            assert plane.intent.twist == ZERO_VELOCITY
+            reasons.add(plane.intent.reason)
+        # a scan becomes stale before the next one arrives
+        assert reasons == {
             "waiting: this host is too busy: its newest scan is 0.22 s old",
             "waiting: perception is silent",
         }
@@ -52,11 +52,11 @@ async def test_it_drives_more_slowly_with_a_reason_while_its_scans_are_late() ->
         await plane.ask_at_once(GOAL, GoalRequest(x=4.5, y=1.5))
         await plane.go(1.5)
         assert "busy" not in plane.intent.reason
-        in_time = await fastest(plane, 1.5)
+        in_time = await max_speed(plane, 1.5)
         plane.late_ticks = 7
         await plane.go(1.0)
         assert plane.intent.reason.endswith("; slower: this host is late by 0.10 s")
-        late = await fastest(plane, 1.5)
+        late = await max_speed(plane, 1.5)
         plane.late_ticks = 0
         await plane.go(3.0)
         assert "busy" not in plane.intent.reason
@@ -65,7 +65,7 @@ async def test_it_drives_more_slowly_with_a_reason_while_its_scans_are_late() ->
         await plane.until("succeeded", seconds=60)
 
 
-async def fastest(plane: Plane, seconds: float) -> float:
+async def max_speed(plane: Plane, seconds: float) -> float:
     speeds = []
     for _ in range(round(seconds * 50)):
         await plane.go(0.02)
@@ -73,7 +73,7 @@ async def fastest(plane: Plane, seconds: float) -> float:
     return max(speeds)
 
 
-LARGE = np.pad(CELLS, ((0, 300), (0, 300)), constant_values=100)
+LARGE_MAP = np.pad(CELLS, ((0, 300), (0, 300)), constant_values=100)
 
 
 async def ticks_of_routes(monkeypatch: pytest.MonkeyPatch, planning_s: float) -> list[int]:
@@ -87,7 +87,7 @@ async def ticks_of_routes(monkeypatch: pytest.MonkeyPatch, planning_s: float) ->
     monkeypatch.setattr(RoutePlanner, "plan", slowly)
     monkeypatch.setattr(route_schedule, "PATIENCE_S", 30.0)
     ticks = []
-    async with Plane(LARGE) as plane:
+    async with Plane(LARGE_MAP) as plane:
         await plane.go(0.2)
         for x in (4.0, 1.5):
             await plane.ask_at_once(GOAL, GoalRequest(x=x, y=0.8))
@@ -98,7 +98,7 @@ async def ticks_of_routes(monkeypatch: pytest.MonkeyPatch, planning_s: float) ->
     return ticks
 
 
-async def test_in_a_large_map_a_route_applies_from_the_same_scan_however_long_it_takes(
+async def test_a_route_in_a_large_map_applies_at_the_same_tick_for_any_planning_time(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     quick = await ticks_of_routes(monkeypatch, 0.0)
@@ -106,7 +106,7 @@ async def test_in_a_large_map_a_route_applies_from_the_same_scan_however_long_it
     assert quick[0] - 10 == 15
 
 
-async def test_a_plan_for_a_huge_map_does_not_delay_the_first_one_for_the_real_map() -> None:
+async def test_planning_in_a_huge_map_does_not_delay_the_first_plan_in_the_next_map() -> None:
     huge = np.zeros((2800, 2800), np.int8)
     async with Plane(CELLS) as plane:
         await plane.go(0.2)

@@ -1,4 +1,4 @@
-"""Tasks and the decision node that executes them: pauses, exploring, roaming, restarts."""
+"""The decision node carries out tasks: pauses, exploration, roaming, restarts."""
 
 import asyncio
 import math
@@ -12,8 +12,8 @@ from gigabrain_zenoh.decision.tasks.task_queue import NO_GOAL
 from tests.node.plane import ROOM, Plane, drawn
 
 CELLS = drawn(ROOM)
-EXPLORES = {"start": "explore"}
-STANDS = Velocity()
+START_EXPLORING = {"start": "explore"}
+ZERO_VELOCITY = Velocity()
 
 
 async def test_a_restart_of_the_driver_does_not_end_a_task() -> None:
@@ -21,19 +21,19 @@ async def test_a_restart_of_the_driver_does_not_end_a_task() -> None:
         await plane.go(0.2)
         await plane.ask_at_once(GOAL, GoalRequest(x=4.0, y=0.8))
         await plane.go(2.0)
-        plane.driver_starts_anew()
+        plane.restart_driver()
         await plane.go(3.0)
         assert plane.intent.reason.startswith("going to (4.00, 0.80): ")
 
 
-async def test_a_paused_task_stands_and_a_goal_before_it_goes_first() -> None:
+async def test_a_goal_may_preempt_a_paused_task() -> None:
     async with Plane(CELLS) as plane:
         await plane.go(0.2)
         await plane.ask(GOAL, GoalRequest(x=4.0, y=0.8))
         await plane.go(1.0)
         await plane.ask(TASK_CHANGE, TaskRequest(do="pause", source="bob"))
         await plane.go(0.3)
-        assert plane.intent.twist == STANDS
+        assert plane.intent.twist == ZERO_VELOCITY
         await plane.ask(GOAL, GoalRequest(x=1.6, y=1.4, how="preempt"))
         await plane.go(0.5)
         assert plane.status.current
@@ -73,18 +73,18 @@ async def test_a_roaming_robot_explores_and_then_visits_places_until_it_gets_a_g
     plane = Plane(
         CELLS,
         at=(2.0, 1.0, 0.3),
-        config=DecisionConfig(behaviour="navigate", settings=EXPLORES),
+        config=DecisionConfig(behaviour="navigate", settings=START_EXPLORING),
     )
     plane.known[:] = -1
     async with plane:
-        said = []
+        first_words = []
         for _ in range(40):
             await plane.go(0.5)
-            said.append(plane.intent.reason.partition(" ")[0])
-            if said[-1] == "going":
+            first_words.append(plane.intent.reason.partition(" ")[0])
+            if first_words[-1] == "going":
                 break
-        assert "exploring:" in said
-        assert said[-1] == "going"
+        assert "exploring:" in first_words
+        assert first_words[-1] == "going"
         current = plane.status.current
         assert current
         assert (current.label, current.source) == ("roaming", "itself")
@@ -96,7 +96,7 @@ async def test_a_roaming_robot_explores_and_then_visits_places_until_it_gets_a_g
 async def test_a_robot_whose_tasks_were_cancelled_does_not_roam_after_a_restart(
     tmp_path: Path,
 ) -> None:
-    config = DecisionConfig(behaviour="navigate", settings=EXPLORES, state_dir=str(tmp_path))
+    config = DecisionConfig(behaviour="navigate", settings=START_EXPLORING, state_dir=str(tmp_path))
     async with Plane(CELLS, config=config) as plane:
         await plane.go(0.5)
         await plane.ask(TASK_CHANGE, TaskRequest(do="cancel", task="all", source="ann"))
@@ -108,7 +108,7 @@ async def test_a_robot_whose_tasks_were_cancelled_does_not_roam_after_a_restart(
         await plane.restart()
         await plane.go(1.0)
         assert plane.intent.reason == NO_GOAL.reason
-        plane.driver_starts_anew()
+        plane.restart_driver()
         await plane.restart()
         await plane.go(1.0)
         assert plane.status.current

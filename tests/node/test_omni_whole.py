@@ -1,4 +1,4 @@
-"""A body that can go sideways, driven by all of the robot's own nodes, in memory and fake time."""
+"""A body that can drive sideways, with all nodes of the robot, in memory and fake time."""
 
 import functools
 import math
@@ -29,24 +29,24 @@ from tests.unit.mapping.rooms import box, ranges
 from tests.unit.navigation.drives import OMNI, wall
 
 TICK_S, SCAN_TICKS, DELAY_TICKS, LAG_S = 0.02, 5, 3, 0.1
-THICK = 0.1  # [m], the wall at y 1.2 to 1.3; its gap is 0.56 m wide, the body 0.24 x 0.6 m
+WALL_THICKNESS_M = 0.1  # at y 1.2 to 1.3; its gap is 0.56 m wide, the body 0.24 x 0.6 m
 WALLS = np.array(
     [
         *box(-1.5, -1.2, 4.0, 4.4),
-        *box(-1.5, 1.2, 2.22, THICK),
-        *box(1.28, 1.2, 1.22, THICK),
+        *box(-1.5, 1.2, 2.22, WALL_THICKNESS_M),
+        *box(1.28, 1.2, 1.22, WALL_THICKNESS_M),
     ]
 )
 POINTS = np.vstack([wall((x0, y0), (x1, y1)) for x0, y0, x1, y1 in WALLS.tolist()])
 ANGLES = np.arange(360) * math.tau / 360
 
 
-class Body:
-    """Goes where it is told, late and lagging, in all directions of the plane."""
+class OmniBody:
+    """Drives as commanded in all directions of the plane, with a delay and a lag."""
 
     def __init__(self) -> None:
         self.pose, self.velocity = (0.0, 0.0, 0.0), ZERO
-        self.tick, self.least = 0, math.inf
+        self.tick, self.min_clearance = 0, math.inf
         self.poses: list[tuple[float, float, float]] = []
         self._queue = deque([ZERO] * DELAY_TICKS)
         self._noise = np.random.default_rng(3)
@@ -67,7 +67,7 @@ class Body:
             math.remainder(yaw + w * TICK_S, math.tau),
         )
         self.poses.append(self.pose)
-        self.least = min(self.least, self._room())
+        self.min_clearance = min(self.min_clearance, self._clearance())
 
     def state(self) -> RobotState:
         x, y, yaw = self.pose
@@ -85,7 +85,7 @@ class Body:
             ranges=ranges_bytes(seen),
         )
 
-    def _room(self) -> float:
+    def _clearance(self) -> float:
         x, y, yaw = self.pose
         cosine, sine = math.cos(yaw), math.sin(yaw)
         here = (POINTS - (x, y)) @ np.array(((cosine, -sine), (sine, cosine)))
@@ -96,7 +96,7 @@ async def _safety(bus: Bus, ready: Callable[[], None]) -> None:
     await safety.run(bus, ready, lambda _now_ns: Host())
 
 
-def nodes(body: Body, folder: Path) -> dict[str, Node]:
+def nodes(body: OmniBody, folder: Path) -> dict[str, Node]:
     settings = DecisionConfig(
         behaviour="navigate", settings={"unknown_space": "allow"}, compile_first=True
     )
@@ -111,25 +111,25 @@ def nodes(body: Body, folder: Path) -> dict[str, Node]:
     }
 
 
-async def test_it_goes_sideways_through_a_gap_that_it_would_not_fit_through_ahead(
+async def test_it_drives_sideways_through_a_gap_narrower_than_its_length(
     tmp_path: Path,
 ) -> None:
-    body = Body()
+    body = OmniBody()
     async with InMemoryRobot(nodes(body, tmp_path)) as robot:
         states = robot.operator.latest(STATE)
-        told: list[TaskStatus] = []
-        robot.operator.subscribe(TASK, lambda _, status: told.append(status))
+        statuses: list[TaskStatus] = []
+        robot.operator.subscribe(TASK, lambda _, status: statuses.append(status))
         while not (states.current and states.current.gate.mode == "enabled") or body.tick < 100:
             await robot.tick()
         (reply,) = await robot.ask(GOAL, GoalRequest(x=1.0, y=2.3, yaw=0.0, source="test"))
         assert reply.ok, reply.text
-        while not told[-1].done and body.tick < 3000:
+        while not statuses[-1].done and body.tick < 3000:
             await robot.tick()
-    assert told[-1].done[0].state == "succeeded", told[-1]
+    assert statuses[-1].done[0].state == "succeeded", statuses[-1]
     x, y, yaw = body.pose
     assert math.hypot(x - 1.0, y - 2.3) < 0.15
     assert abs(yaw) < 0.2
-    assert body.least > 0.0
+    assert body.min_clearance > 0.0
     within = [pose for pose in body.poses if 1.1 < pose[1] < 1.4]
     assert within
     assert max(abs(math.sin(yaw)) for _, _, yaw in within) < 0.5

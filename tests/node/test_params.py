@@ -1,4 +1,4 @@
-"""Parameters: what can be set changes what the process does, and nothing else can be set."""
+"""Parameters: each one changes what the process does, and unknown ones are refused."""
 
 import dataclasses
 import functools
@@ -43,12 +43,12 @@ def root_level() -> Iterator[None]:
     logging.getLogger().setLevel(before)
 
 
-async def wants(name: str, value: str, *, ahead: bool) -> list[Velocity | None]:
+async def avoid_twists(name: str, value: str, *, ahead: bool) -> list[Velocity | None]:
     """Return the velocities that `avoid` wants, before and after a parameter is set."""
     wanted, world = [], WorldModel(scan_ok=True, obstacle_ahead=False, sectors=MORE_ROOM_LEFT)
     async with NodeBench(functools.partial(decision.run, DecisionConfig())) as bench:
         for tick in (10, 20):
-            for now, seen in ((tick, False), (tick + 5, ahead)):  # each turn is a new one
+            for now, seen in ((tick, False), (tick + 5, ahead)):  # a new turn each time
                 bench.send(STATE, state(now))
                 here = replace(world, boot=7, tick=now, basis=now, obstacle_ahead=seen)
                 bench.send(WORLD, here)
@@ -58,21 +58,21 @@ async def wants(name: str, value: str, *, ahead: bool) -> list[Velocity | None]:
 
 
 async def max_linear_speed() -> None:
-    assert await wants("max_linear_speed", "0.05", ahead=False) == [
+    assert await avoid_twists("max_linear_speed", "0.05", ahead=False) == [
         Velocity(linear_x=0.2),
         Velocity(linear_x=0.05),
     ]
 
 
 async def max_angular_speed() -> None:
-    assert await wants("max_angular_speed", "0.3", ahead=True) == [
+    assert await avoid_twists("max_angular_speed", "0.3", ahead=True) == [
         Velocity(angular_z=-0.5),
         Velocity(angular_z=-0.3),
     ]
 
 
 async def turn() -> None:
-    assert await wants("turn", "clearer", ahead=True) == [
+    assert await avoid_twists("turn", "clearer", ahead=True) == [
         Velocity(angular_z=-0.5),
         Velocity(angular_z=0.5),
     ]
@@ -102,31 +102,31 @@ async def route_speed() -> None:
 
 
 async def inflation() -> None:
-    """Past a pillar beside its straight way it keeps more room."""
+    """With more inflation it passes a pillar beside its straight path at a larger distance."""
     near, far = [
-        await passing({"inflation": value}, at=(1.2, 1.6, 0.0), goal=(3.8, 1.6), cells=PILLAR)
+        await drive_with({"inflation": value}, at=(1.2, 1.6, 0.0), goal=(3.8, 1.6), cells=PILLAR)
         for value in ("0.1", "1.5")
     ]
     assert far.closest > near.closest + 0.05
 
 
 async def aggressiveness() -> None:
-    """Gently it gains less speed from scan to scan."""
+    """With less aggressiveness it gains less speed from scan to scan."""
     gains = []
     for value in ("0", "0.5"):
-        plane = await passing({"aggressiveness": value}, at=(1.2, 1.6, 0.0), goal=(2.6, 1.6))
+        plane = await drive_with({"aggressiveness": value}, at=(1.2, 1.6, 0.0), goal=(2.6, 1.6))
         wanted = [one.twist.linear_x for one in plane.intents if one.twist]
         gains.append(max(after - before for before, after in pairwise(wanted)))
     assert 0.0 < gains[0] < 0.6 * gains[1]
 
 
-async def passing(
+async def drive_with(
     changes: dict[str, str],
     at: tuple[float, float, float],
     goal: tuple[float, float],
     cells: Cells = HALL,
 ) -> Plane:
-    """The robot after it has driven to a goal, with parameters set before."""
+    """Set parameters, drive to a goal, and return the robot."""
     async with Plane(cells, at=at) as plane:
         await plane.go(0.2)
         for name, value in changes.items():
@@ -146,8 +146,8 @@ async def log_level() -> None:
             )
 
 
-# every parameter of every behaviour, with what shows that it is obeyed
-OBEYED: dict[tuple[str, str], Callable[[], Awaitable[None]]] = {
+# (behaviour, parameter) -> a check that it has an effect
+CHECKS: dict[tuple[str, str], Callable[[], Awaitable[None]]] = {
     ("avoid", "max_linear_speed"): max_linear_speed,
     ("avoid", "max_angular_speed"): max_angular_speed,
     ("avoid", "turn"): turn,
@@ -157,19 +157,21 @@ OBEYED: dict[tuple[str, str], Callable[[], Awaitable[None]]] = {
 }
 
 
-@pytest.mark.parametrize("which", OBEYED, ids=" ".join)
-async def test_every_parameter_of_a_behaviour_changes_what_the_robot_does(
+@pytest.mark.parametrize("which", CHECKS, ids=" ".join)
+async def test_every_parameter_of_a_behaviour_has_an_effect(
     which: tuple[str, str],
 ) -> None:
-    await OBEYED[which]()
+    await CHECKS[which]()
 
 
-def test_no_behaviour_has_a_parameter_without_such_a_test() -> None:
-    there = {(name, param) for name in behaviours.SHIPPED for param in behaviours.load(name).PARAMS}
-    assert there == set(OBEYED)
+def test_every_parameter_of_a_behaviour_is_tested() -> None:
+    parameters = {
+        (name, param) for name in behaviours.SHIPPED for param in behaviours.load(name).PARAMS
+    }
+    assert parameters == set(CHECKS)
 
 
-async def test_the_log_level_of_a_process_is_obeyed(root_level: None) -> None:
+async def test_the_log_level_can_be_set(root_level: None) -> None:
     await log_level()
 
 
@@ -181,7 +183,7 @@ async def test_the_log_level_of_a_process_is_obeyed(root_level: None) -> None:
         ("avoid", "samples", "max_linear_speed, max_angular_speed, turn"),
     ],
 )
-async def test_what_the_present_behaviour_does_not_read_is_refused_with_what_can_be_set(
+async def test_a_parameter_of_another_behaviour_is_refused_with_the_known_ones(
     behaviour: str, foreign: str, known: str
 ) -> None:
     async with NodeBench(
@@ -194,8 +196,8 @@ async def test_what_the_present_behaviour_does_not_read_is_refused_with_what_can
     assert str(refused.value).endswith(f"known: {known}")
 
 
-def test_a_speed_limit_is_set_without_forgetting_what_was_seen() -> None:
-    """The way round a wall is longer, also once no beam hits the wall any more."""
+def test_a_new_speed_limit_keeps_the_obstacles_seen_before() -> None:
+    """The path still leads round a wall that no beam hits any more, so it is longer."""
     drive = Drive(WAFFLE, Goal(x=3.0, y=0.0), wall((1.0, -1.0), (1.0, 1.0)))
     seen = drive.request()
     unseen = dataclasses.replace(seen, hits=np.empty((0, 2)))
@@ -205,7 +207,7 @@ def test_a_speed_limit_is_set_without_forgetting_what_was_seen() -> None:
     assert LocalPlanner(WAFFLE, QUICK).plan(unseen).remaining == pytest.approx(3.0, abs=0.1)
 
 
-async def test_a_planner_obeys_a_body_that_has_become_slower_on_its_way() -> None:
+async def test_a_planner_obeys_a_speed_limit_of_the_body_set_during_the_drive() -> None:
     async with Plane(HALL, at=(0.6, 1.6, 0.0)) as plane:
         await plane.go(0.2)
         await plane.ask(GOAL, GoalRequest(x=4.2, y=1.6))
@@ -226,7 +228,7 @@ async def test_a_planner_obeys_a_body_that_has_become_slower_on_its_way() -> Non
         ("avoid", {"turn": "up"}, "turn: expected "),
     ],
 )
-def test_settings_that_the_behaviour_does_not_have_are_refused(
+def test_unknown_or_invalid_settings_of_a_behaviour_are_refused(
     behaviour: str, settings: dict[str, Any], problem: str
 ) -> None:
     config = DecisionConfig(behaviour=behaviour, settings=settings)
@@ -234,7 +236,7 @@ def test_settings_that_the_behaviour_does_not_have_are_refused(
         behaviours.check(config)
 
 
-OLD = """
+OLD_YAML = """
 decision:
   behaviour: {behaviour}
   linear_speed: 0.1
@@ -255,11 +257,11 @@ decision:
         ),
     ],
 )
-def test_yaml_with_the_old_words_means_the_same(
+def test_yaml_with_old_names_means_the_same(
     tmp_path: Path, behaviour: str, settings: dict[str, Any]
 ) -> None:
     path = tmp_path / "robot.yaml"
-    path.write_text(OLD.format(behaviour=behaviour))
+    path.write_text(OLD_YAML.format(behaviour=behaviour))
     config = load_deployment(path).decision
     assert config == DecisionConfig(behaviour=behaviour, settings=settings)
     behaviours.check(config, path)

@@ -14,7 +14,7 @@ from gigabrain_zenoh.manipulation.pick_place import NoWay, PickPlacePlanner
 from gigabrain_zenoh.qa.bench.hands import arm_before, draw, measure_hands, pan_axis
 
 TABLE = Thing(name="table", kind="floor", position=np.array([0.0, 0.0, -0.001]))
-SEEDS = (0, 2, 4, 5, 9, 13)  # two of each kind, light and heavy
+SEEDS = (0, 2, 4, 5, 9, 13)  # for each kind a light and a heavy thing
 
 
 @pytest.fixture(scope="module")
@@ -40,7 +40,7 @@ def test_things_of_all_kinds_are_picked_up_and_put_down() -> None:
 
 
 @pytest.mark.parametrize("body", ["so101", "piper"])
-def test_what_is_held_does_not_slide_along_the_pads_while_the_arm_swings(body: str) -> None:
+def test_a_held_thing_does_not_slide_along_the_pads_while_the_arm_moves(body: str) -> None:
     robot, _, options, folder = load_link(body, Run(folder=Path()))
     assert isinstance(options, MujocoOptions)
     assert robot.arm
@@ -50,7 +50,7 @@ def test_what_is_held_does_not_slide_along_the_pads_while_the_arm_swings(body: s
     drawn = draw(np.random.default_rng(5), pan_axis(kinematics))
     arm = arm_before(drawn, robot, model)
 
-    def in_tool() -> np.ndarray:
+    def thing_in_tool() -> np.ndarray:
         tool = kinematics.forward(np.array([arm.measured(name) for name in names]))
         return tool.axes.T @ (arm.thing() - tool.position)
 
@@ -58,16 +58,16 @@ def test_what_is_held_does_not_slide_along_the_pads_while_the_arm_swings(body: s
     assert not isinstance(pick, NoWay)
     for phase in pick.phases:
         arm.carry_out(phase)
-    before = in_tool()
+    before = thing_in_tool()
     across = np.array([drawn.x, -drawn.y, drawn.height])
     place = planner.place(pick.held, across, [TABLE], arm.posture(names), pick.grasp.opening)
     assert not isinstance(place, NoWay)
     assert place.phases[0].name == "traverse"
     arm.carry_out(place.phases[0])
-    assert np.linalg.norm(in_tool() - before) < 0.003
+    assert np.linalg.norm(thing_in_tool() - before) < 0.003
 
 
-def test_a_plan_is_the_same_each_time(planner: PickPlacePlanner) -> None:
+def test_equal_inputs_give_equal_plans(planner: PickPlacePlanner) -> None:
     thing = draw(np.random.default_rng(1), pan_axis(planner.arm)).thing()
     plans = [planner.pick(thing, [TABLE], home(planner)) for _ in range(2)]
     assert not any(isinstance(one, NoWay) for one in plans)
@@ -84,7 +84,7 @@ def test_a_plan_is_the_same_each_time(planner: PickPlacePlanner) -> None:
          "cm wide"),
     ],
 )  # fmt: skip
-def test_what_cannot_be_grasped_is_refused_with_its_reason(
+def test_a_thing_that_cannot_be_grasped_is_refused_with_the_reason(
     planner: PickPlacePlanner, thing: Thing, why: str
 ) -> None:
     found = planner.pick(thing, [TABLE], home(planner))
@@ -92,7 +92,7 @@ def test_what_cannot_be_grasped_is_refused_with_its_reason(
     assert why in found.reason
 
 
-def test_a_place_out_of_reach_is_refused_with_its_reason(planner: PickPlacePlanner) -> None:
+def test_a_place_out_of_reach_is_refused_with_the_reason(planner: PickPlacePlanner) -> None:
     thing = draw(np.random.default_rng(1), pan_axis(planner.arm)).thing()
     pick = planner.pick(thing, [TABLE], home(planner))
     assert not isinstance(pick, NoWay)
@@ -104,13 +104,13 @@ def test_a_place_out_of_reach_is_refused_with_its_reason(planner: PickPlacePlann
 
 
 @pytest.mark.parametrize("wrist", [-1.2, 0.0, 1.2])
-def test_a_thing_that_was_tilted_on_the_way_is_put_down_on_its_foot(
+def test_a_thing_tilted_on_the_way_is_put_down_upright(
     planner: PickPlacePlanner, wrist: float
 ) -> None:
-    foot = Thing(
+    can = Thing(
         name="can", kind="cylinder", size=(0.02, 0.06), position=np.array([0.24, 0.0, 0.03])
     )
-    pick = planner.pick(foot, [TABLE], home(planner))
+    pick = planner.pick(can, [TABLE], home(planner))
     assert not isinstance(pick, NoWay)
     carrying = np.array([0.0, -1.0, 0.4, wrist, 0.3])
     found = planner.place(

@@ -1,4 +1,4 @@
-"""Process replay: the recorded drive of each world through the processes as they are now."""
+"""Process replay: recorded drives, fed to the present processes, give the same outputs."""
 
 import asyncio
 import functools
@@ -75,9 +75,7 @@ REPLAYS = [
 
 
 @pytest.mark.parametrize(("name", "process"), REPLAYS)
-async def test_every_process_does_what_it_did_on_the_recorded_drive(
-    name: str, process: str
-) -> None:
+async def test_every_process_behaves_as_on_the_recorded_drive(name: str, process: str) -> None:
     path = file_of(RECORDINGS, name)
     outcome = await replay_process(path, process, settings_for(path, process, None), node_of)
     assert outcome.same, (outcome, RENEW)
@@ -85,10 +83,10 @@ async def test_every_process_does_what_it_did_on_the_recorded_drive(
     assert not outcome.begun_late
 
 
-async def test_control_of_a_body_with_a_control_topic_of_its_own_does_what_it_did(
+async def test_control_with_a_custom_control_topic_behaves_as_recorded(
     tmp_path: Path,
 ) -> None:
-    def commanded_elsewhere() -> Iterator[ReceivedMessage]:
+    def with_custom_topic() -> Iterator[ReceivedMessage]:
         for sample in Bag(file_of(RECORDINGS, "arena")):
             key, payload, message = sample.key, sample.payload, message_of(sample)
             if isinstance(message, Body):
@@ -99,14 +97,14 @@ async def test_control_of_a_body_with_a_control_topic_of_its_own_does_what_it_di
             yield ReceivedMessage(sample.log_ns, key, sample.encoding, payload, sample.header)
 
     path = tmp_path / "own.mcap"
-    bags.write(path, commanded_elsewhere())
+    bags.write(path, with_custom_topic())
     outcome = await replay_process(path, "control", {}, node_of)
     assert outcome.same, outcome
     assert outcome.compared > 30
 
 
 def reasons(name: str) -> set[str]:
-    """The first words of all that decision gave as a reason on a drive."""
+    """Return the first words of decision's reasons on a drive."""
     return {
         getattr(message_of(sample), "reason", "").partition(" ")[0]
         for sample in Bag(file_of(RECORDINGS, name))
@@ -114,13 +112,13 @@ def reasons(name: str) -> set[str]:
     }
 
 
-def test_the_recorded_drives_turn_away_from_something() -> None:
+def test_the_recorded_drives_contain_turns() -> None:
     for name in ("arena", "house", "warehouse", "random_1"):
         assert "turning" in reasons(name), name
         assert file_of(RECORDINGS, name).stat().st_size < 102_400
 
 
-def test_the_recorded_exploration_goes_somewhere() -> None:
+def test_the_recorded_exploration_contains_exploring() -> None:
     assert "exploring:" in reasons("exploring")
     assert file_of(RECORDINGS, "exploring").stat().st_size < 307_200
 
@@ -131,7 +129,7 @@ def call(*arguments: str) -> object:
     )
 
 
-def test_of_a_process_that_was_changed_the_first_difference_is_shown(
+def test_the_first_difference_of_a_changed_process_is_shown(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = file_of(RECORDINGS, "arena")
@@ -141,10 +139,10 @@ def test_of_a_process_that_was_changed_the_first_difference_is_shown(
     assert call(*command) == 0
     assert "decision behaves as recorded" in capsys.readouterr().out
     assert call(*command, "--deployment", str(changed)) == 1
-    told = capsys.readouterr().out.splitlines()
-    assert told[0] == f"{path}: decision behaves differently; first difference:"
-    assert told[1].startswith("robot/intent at tick ")
-    assert told[2] == "  twist.linear_x: recorded 0.2, now 0.1"
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0] == f"{path}: decision behaves differently; first difference:"
+    assert lines[1].startswith("robot/intent at tick ")
+    assert lines[2] == "  twist.linear_x: recorded 0.2, now 0.1"
 
 
 def test_a_recording_without_the_process_is_refused(tmp_path: Path) -> None:
@@ -154,65 +152,65 @@ def test_a_recording_without_the_process_is_refused(tmp_path: Path) -> None:
         call("replay", "--check", str(path), "--process", "safety")
 
 
-USED = InputLog(began_ns=0, keys=("robot/state",), taken=(ConsumedInput(key=0, seq=1, after_us=0),))
+USED_INPUTS = InputLog(
+    began_ns=0, keys=("robot/state",), taken=(ConsumedInput(key=0, seq=1, after_us=0),)
+)
 
 
-@pytest.mark.parametrize("logged", [{}, {"robot/input_log/control": USED}])
+@pytest.mark.parametrize("logged", [{}, {"robot/input_log/control": USED_INPUTS}])
 def test_a_recording_without_the_inputs_of_the_process_is_refused(
     tmp_path: Path, logged: dict[str, Message]
 ) -> None:
     path = tmp_path / "a.mcap"
-    said = {"robot/cmd_vel": replace(example(CmdVel), source="control"), **logged}
-    bags.write(path, (bags.arrival(1, key, codec.encode(one)) for key, one in said.items()))
+    messages = {"robot/cmd_vel": replace(example(CmdVel), source="control"), **logged}
+    bags.write(path, (bags.arrival(1, key, codec.encode(one)) for key, one in messages.items()))
     with pytest.raises(ConfigError, match="holds no input of control; record all topics"):
         call("replay", "--check", str(path), "--process", "control")
 
 
 @pytest.mark.parametrize("key", [INPUT_LOG.at("decision"), REQUEST_LOG.key])
-def test_an_invalid_message_among_the_logs_of_a_process_is_left_out(
-    tmp_path: Path, key: str
-) -> None:
+def test_an_invalid_message_in_the_logs_of_a_process_is_skipped(tmp_path: Path, key: str) -> None:
     path = tmp_path / "a.mcap"
-    told = [*bags.drive(5), bags.arrival(10**9, INTENT.key, codec.encode(example(INTENT.type)))]
-    bags.write(path, iter([*told, bags.arrival(2 * 10**9, key, b'{"linear_x": 0.2}')]))
+    arrivals = [*bags.drive(5), bags.arrival(10**9, INTENT.key, codec.encode(example(INTENT.type)))]
+    bags.write(path, iter([*arrivals, bags.arrival(2 * 10**9, key, b'{"linear_x": 0.2}')]))
     assert [key for _, key, _ in load_run(path, "decision").inputs] == [
         *[STATE.key] * 5, SCAN.key,
     ]  # fmt: skip
 
 
-def test_without_its_settings_a_process_is_not_replayed_as_another(tmp_path: Path) -> None:
+def test_a_recording_without_the_settings_of_the_process_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
     bags.write(path, bags.drive(10))
     with pytest.raises(ConfigError, match=r"not hold the settings of decision: .* --deployment F"):
         call("replay", "--check", str(path), "--process", "decision")
 
 
-def granted(service: str, tick: int, basis: int) -> bytes:
+def accepted_request(service: str, tick: int, basis: int) -> bytes:
     return codec.encode(
         AcceptedRequest(service=service, request="{}", boot=7, tick=tick, basis=basis)
     )
 
 
-def said(topic: Topic[Any], tick: int, boot: int = 7) -> Event:
+def event_of(topic: Topic[Any], tick: int, boot: int = 7) -> Event:
     message = replace(example(topic.type), boot=boot, tick=tick, basis=tick)
     return tick * 20, topic.key, codec.encode(message)
 
 
-def test_a_request_is_fed_where_it_counted_and_not_where_its_record_came() -> None:
+def test_a_request_is_fed_when_it_took_effect_and_not_when_it_was_recorded() -> None:
     received = [
-        said(STATE, 90, boot=6),  # of an earlier start of the driver, which counted further
-        said(STATE, 5),
-        said(WORLD, 5),
-        said(STATE, 6),
-        said(STATE, 7),
-        (150, REQUEST_LOG.key, granted("robot/goal", tick=6, basis=0)),
-        (151, REQUEST_LOG.key, granted("robot/mission", tick=6, basis=5)),
+        event_of(STATE, 90, boot=6),  # from an earlier boot with a larger tick
+        event_of(STATE, 5),
+        event_of(WORLD, 5),
+        event_of(STATE, 6),
+        event_of(STATE, 7),
+        (150, REQUEST_LOG.key, accepted_request("robot/goal", tick=6, basis=0)),
+        (151, REQUEST_LOG.key, accepted_request("robot/mission", tick=6, basis=5)),
     ]
     order = [(at, key) for at, key, _ in with_requests(received)]
     assert order == [
         (1800, "robot/state"),
         (100, "robot/state"),
-        (100, "robot/goal"),  # that world had not been thought about
+        (100, "robot/goal"),  # before the process used that world
         (100, "robot/world"),
         (120, "robot/state"),
         (140, "robot/mission"),
@@ -220,30 +218,30 @@ def test_a_request_is_fed_where_it_counted_and_not_where_its_record_came() -> No
     ]
 
 
-async def test_a_replay_waits_for_the_node_and_for_its_answers() -> None:
-    told: list[str] = []
+async def test_a_replay_waits_until_the_node_is_ready_and_replies() -> None:
+    calls: list[str] = []
 
     async def node(bus: Bus, ready: Callable[[], None]) -> None:
         async def go(request: GoalRequest) -> GoalReply:
-            await asyncio.to_thread(lambda: told.append(f"goes to {request.x:g}"))
+            await asyncio.to_thread(lambda: calls.append(f"goes to {request.x:g}"))
             return GoalReply(ok=True, text="on the way")
 
-        await asyncio.to_thread(lambda: told.append("compiles"))
+        await asyncio.to_thread(lambda: calls.append("compiles"))
         bus.serve(GOAL, go)
-        bus.subscribe(STATE, lambda _key, state: told.append(f"tick {state.tick}"))
+        bus.subscribe(STATE, lambda _key, state: calls.append(f"tick {state.tick}"))
         ready()
         await bus.failed
 
     goal = codec.encode(GoalRequest(x=3.0, y=0.0))
-    await replay(node, [said(STATE, 1), (30, GOAL.key, goal), said(STATE, 2)])
-    assert told == ["compiles", "tick 1", "goes to 3", "tick 2"]
+    await replay(node, [event_of(STATE, 1), (30, GOAL.key, goal), event_of(STATE, 2)])
+    assert calls == ["compiles", "tick 1", "goes to 3", "tick 2"]
 
 
-def test_a_replay_runs_no_programs_and_remembers_nothing(tmp_path: Path) -> None:
+def test_a_replay_runs_no_scripts_and_saves_no_state(tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
     notes = {"decision": '{"behaviour":"navigate","scripts":"/bin","state_dir":"/tmp"}'}
     with Recorder(path, RecorderConfig(notes=notes, keep_free_mb=0)) as recorder:
-        recorder.intake.receive(STATE.key, "", said(STATE, 1)[2])
+        recorder.intake.receive(STATE.key, "", event_of(STATE, 1)[2])
     settings = settings_for(path, "decision", None)
     assert settings == {
         "behaviour": "navigate",
@@ -252,7 +250,7 @@ def test_a_replay_runs_no_programs_and_remembers_nothing(tmp_path: Path) -> None
     }
 
 
-async def test_a_decision_that_was_sent_to_a_place_does_the_same_again() -> None:
+async def test_a_replayed_decision_drives_to_its_goal_as_before() -> None:
     async with Plane(drawn(ROOM)) as plane:
         events = record(plane.bench.network, plane.bench.clock)
         await plane.go(1.0)
@@ -270,13 +268,15 @@ async def test_a_decision_that_was_sent_to_a_place_does_the_same_again() -> None
     node = functools.partial(decision.run, DecisionConfig(behaviour="navigate"))
     now = [(key, data) for key, data in await replay(node, received) if key in own]
     assert plane.travelled > 0.3
-    said_now = [unstamped(*one) for one in now]
-    getting_ready = [one for one in said_now if not one["boot"]]  # this was not recorded
-    assert {one["key"] for one in getting_ready} == {TASK.key}
-    assert said_now[len(getting_ready) :] == [unstamped(*one) for one in then]
+    unstamped_now = [unstamped(*one) for one in now]
+    before_first_tick = [
+        one for one in unstamped_now if not one["boot"]
+    ]  # sent before the recording
+    assert {one["key"] for one in before_first_tick} == {TASK.key}
+    assert unstamped_now[len(before_first_tick) :] == [unstamped(*one) for one in then]
 
 
-async def test_a_parameter_that_was_changed_meanwhile_is_changed_again(tmp_path: Path) -> None:
+async def test_a_parameter_change_during_the_recording_is_replayed(tmp_path: Path) -> None:
     async with RobotInMemory(tmp_path) as robot:
         events = record(robot.network, robot.clock)
         serve_params(robot.bus("decision"))
@@ -295,7 +295,7 @@ async def test_a_parameter_that_was_changed_meanwhile_is_changed_again(tmp_path:
 
 
 @pytest.mark.parametrize("process", ["decision", "control", "safety"])
-async def test_a_limit_of_the_body_that_was_changed_meanwhile_is_in_the_recording(
+async def test_a_change_of_body_limits_during_the_recording_is_replayed(
     tmp_path: Path, process: str
 ) -> None:
     topics = {topic.key for topic in OUTPUTS[process]}
@@ -319,7 +319,7 @@ def unstamped(key: str, payload: bytes) -> dict[str, Any]:
     return dict(msgspec.msgpack.decode(payload)) | {"key": key, "stamp_ns": 0}
 
 
-def test_a_reworded_cause_is_no_difference_and_another_code_is() -> None:
+def test_another_text_of_a_cause_is_no_difference_but_another_code_is() -> None:
     def verdict(code: str, text: str) -> SafetyState:
         return SafetyState(verdict="stop", causes=(Cause(code=code, text=text, remedy=text),))
 

@@ -1,4 +1,4 @@
-"""Rendered cameras see what the physics has, at the right pixels, and go their way onto the bus."""
+"""Rendered cameras show the physics at the right pixels, and publish their pictures."""
 
 import asyncio
 import functools
@@ -33,7 +33,7 @@ from gigabrain_zenoh.testing.waiting import until
 
 BOOT = samples.BOOT
 FRONT = load_robot("turtlebot3_waffle").cameras[0]
-SEEN = np.array([1, 1, 0, 1, 1, 1], np.uint8)  # not the robot itself
+SEEN_GEOM_GROUPS = np.array([1, 1, 0, 1, 1, 1], np.uint8)  # without the robot itself
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -51,13 +51,13 @@ def driver() -> MujocoDriver:
     return made
 
 
-def sent(driver: MujocoDriver) -> tuple[SimScene, SimPoses]:
+def scene_and_poses(driver: MujocoDriver) -> tuple[SimScene, SimPoses]:
     (_, scene), (_, poses) = driver._world.scene()
     return scene, poses  # type: ignore[return-value]
 
 
 def true_depth(driver: MujocoDriver, camera: Camera, u: float, v: float) -> float:
-    """The depth along the camera's axis by a ray through a pixel, from the physics itself [m]."""
+    """Return the depth along the camera's axis [m] at a pixel, by a ray in the physics."""
     model, data = driver._simulation.model, driver._simulation.data
     base = model.body("robot/base").id
     turn = data.xmat[base].reshape(3, 3)
@@ -66,19 +66,21 @@ def true_depth(driver: MujocoDriver, camera: Camera, u: float, v: float) -> floa
     fx, fy, cx, cy = camera.pinhole
     ray = turn @ mounting(camera) @ np.array([1.0, -(u - cx) / fx, -(v - cy) / fy])
     hit = np.zeros(1, np.int32)
-    distance = mujoco.mj_ray(model, data, place, ray / np.linalg.norm(ray), SEEN, 1, -1, hit)
+    distance = mujoco.mj_ray(
+        model, data, place, ray / np.linalg.norm(ray), SEEN_GEOM_GROUPS, 1, -1, hit
+    )
     return float(distance / np.linalg.norm(ray)) if distance > 0 else np.inf
 
 
-LEANING = replace(FRONT, pitch=0.3, roll=0.1, yaw=0.4, z=0.3)
-OTHER = replace(FRONT, intrinsics=(250.0, 230.0, 150.0, 130.0), distortion=(0.0,))
+TILTED = replace(FRONT, pitch=0.3, roll=0.1, yaw=0.4, z=0.3)
+WITH_INTRINSICS = replace(FRONT, intrinsics=(250.0, 230.0, 150.0, 130.0), distortion=(0.0,))
 
 
-@pytest.mark.parametrize("camera", [FRONT, LEANING, OTHER], ids=["front", "leaning", "intrinsics"])
-def test_the_depth_of_pixels_is_that_of_rays_in_the_physics(
-    driver: MujocoDriver, camera: Camera
-) -> None:
-    scene, poses = sent(driver)
+@pytest.mark.parametrize(
+    "camera", [FRONT, TILTED, WITH_INTRINSICS], ids=["front", "tilted", "intrinsics"]
+)
+def test_depth_pixels_agree_with_rays_in_the_physics(driver: MujocoDriver, camera: Camera) -> None:
+    scene, poses = scene_and_poses(driver)
     with closing(Renderer({"front": View(camera, 0, errors=False)})) as renderer:
         renderer.show(scene)
         depth = renderer.expose(poses, ["front"])["front"].depth
@@ -95,7 +97,7 @@ def test_the_depth_of_pixels_is_that_of_rays_in_the_physics(
     assert np.median(off_mm) < 2.0
 
 
-def test_a_lens_bends_the_picture_as_opencv_says() -> None:
+def test_a_lens_distorts_the_picture_like_opencv() -> None:
     bent = replace(FRONT, distortion=(-0.2, 0.05, 0.0, 0.0, 0.0))
     lens = View(bent, 0, errors=False).lens
     assert (lens.width, lens.height) > (FRONT.width, FRONT.height)
@@ -110,10 +112,10 @@ def test_a_lens_bends_the_picture_as_opencv_says() -> None:
     assert focal * bent_x + cx == pytest.approx(300, abs=1.0)
 
 
-def test_pixels_that_no_light_reaches_through_the_lens_stay_dark(driver: MujocoDriver) -> None:
+def test_pixels_without_light_through_the_lens_are_black(driver: MujocoDriver) -> None:
     lens = (190.0, 190.0, 159.5, 119.5), (-0.33, 0.11, 0.0, 0.0, -0.016)
     camera = replace(FRONT, intrinsics=lens[0], distortion=lens[1])
-    scene, poses = sent(driver)
+    scene, poses = scene_and_poses(driver)
     with closing(Renderer({"front": View(camera, 0, errors=False)})) as renderer:
         renderer.show(scene)
         frame = renderer.expose(poses, ["front"])["front"]
@@ -130,11 +132,11 @@ def test_pixels_that_no_light_reaches_through_the_lens_stay_dark(driver: MujocoD
         abs(frame.depth[round(v), round(u)] - 1000 * true_depth(driver, camera, *straight))
         for (u, v), straight in zip(pixels[:, 0], 190 * rays[:, :2] + lens[0][2:], strict=True)
     ]
-    assert np.median(off_mm) < 15.0  # a pixel is up to a half off its ray
+    assert np.median(off_mm) < 15.0  # rounding moves a ray by up to half a pixel
 
 
-class Simulated:
-    """A driver's messages, by hand, for a camera process with real threads."""
+class FakeDriver:
+    """Publishes a driver's messages for a camera process with real threads."""
 
     def __init__(self, driver: MujocoDriver) -> None:
         self.network = LocalNetwork()
@@ -145,7 +147,7 @@ class Simulated:
             self.bus.subscribe(
                 topic, lambda _, message, name=name: self.received[name].append(message)
             )  # type: ignore[misc]
-        self.scene, self.poses = sent(driver)
+        self.scene, self.poses = scene_and_poses(driver)
         self.bus.time.boot = BOOT
 
     def tick(self, tick: int, *, poses: bool = True) -> None:
@@ -155,7 +157,7 @@ class Simulated:
             self.bus.publish(SIM_POSES, self.poses, basis=tick)
 
     async def drive(self, first: int, last: int, *, poses: bool = True) -> None:
-        """Let ticks go by; after each with an exposure wait for it."""
+        """Publish ticks; after each tick with an exposure, wait for the picture."""
         for tick in range(first, last + 1):
             before = len(self.received["image"]) + len(self.received["camera"])
             self.tick(tick, poses=poses)
@@ -168,8 +170,8 @@ class Simulated:
 
 
 @asynccontextmanager
-async def running(driver: MujocoDriver) -> AsyncIterator[tuple[Simulated, Bus]]:
-    world = Simulated(driver)
+async def running(driver: MujocoDriver) -> AsyncIterator[tuple[FakeDriver, Bus]]:
+    world = FakeDriver(driver)
     world.bus.publish(SIM_SCENE, world.scene)
     bus = Bus(world.network.transport(), Clock(), "camera")
     ready = asyncio.Event()
@@ -192,7 +194,7 @@ async def running(driver: MujocoDriver) -> AsyncIterator[tuple[Simulated, Bus]]:
         await world.bus.close()
 
 
-async def test_picture_depth_and_info_carry_stamp_tick_and_basis_of_the_exposure(
+async def test_picture_depth_and_info_have_stamp_tick_and_basis_of_the_exposure(
     driver: MujocoDriver,
 ) -> None:
     async with running(driver) as (world, _):
@@ -210,7 +212,7 @@ async def test_picture_depth_and_info_carry_stamp_tick_and_basis_of_the_exposure
         assert (depths[-1].array() > 0).mean() > 0.3  # type: ignore[attr-defined]
 
 
-def world_stamps(world: Simulated) -> list[tuple[int, int]]:
+def world_stamps(world: FakeDriver) -> list[tuple[int, int]]:
     decode = msgspec.msgpack.Decoder(SimPoses).decode
     poses = [decode(data) for key, data in world.network.sent if key == SIM_POSES.key]
     return [(one.tick, one.stamp_ns) for one in poses]
@@ -226,7 +228,7 @@ def world_stamps(world: Simulated) -> list[tuple[int, int]]:
         ("bright", "overexposed"),
     ],
 )
-async def test_a_fault_is_named_and_its_pictures_are_withheld(
+async def test_a_camera_fault_is_reported_and_its_pictures_are_not_published(
     driver: MujocoDriver, fault: str, problem: str
 ) -> None:
     async with running(driver) as (world, bus):
@@ -246,7 +248,9 @@ async def test_a_fault_is_named_and_its_pictures_are_withheld(
         assert len(world.received["image"]) > before
 
 
-async def test_a_cable_that_is_out_is_known_by_the_robot_s_clock(driver: MujocoDriver) -> None:
+async def test_an_unplugged_camera_is_reported_by_the_clock_of_the_robot(
+    driver: MujocoDriver,
+) -> None:
     async with running(driver) as (world, bus):
         await world.drive(3, 30)
         bus.params.change("front_fault", "unplugged")
@@ -256,14 +260,14 @@ async def test_a_cable_that_is_out_is_known_by_the_robot_s_clock(driver: MujocoD
         assert world.received["camera"][-1].problem == "no picture"  # type: ignore[attr-defined]
 
 
-async def test_time_that_stands_still_is_no_fault_of_a_camera(driver: MujocoDriver) -> None:
+async def test_paused_robot_time_is_no_camera_fault(driver: MujocoDriver) -> None:
     async with running(driver) as (world, bus):
         await world.drive(3, 30)
         await asyncio.sleep(0.6)
         assert not bus.problems
 
 
-async def test_a_driver_that_starts_again_is_seen_at_once(driver: MujocoDriver) -> None:
+async def test_pictures_follow_a_restart_of_the_driver_at_once(driver: MujocoDriver) -> None:
     async with running(driver) as (world, bus):
         await world.drive(3, 30)
         world.bus.time.boot = BOOT + 1
@@ -288,7 +292,7 @@ def test_a_distortion_that_folds_the_picture_is_refused() -> None:
         View(replace(FRONT, distortion=(-90.0, 0.0, 0.0, 0.0, 0.0)), 0, errors=False)
 
 
-async def test_a_scene_that_cannot_be_drawn_is_said_and_a_good_one_is_drawn_again(
+async def test_an_invalid_scene_is_reported_and_the_next_valid_one_is_drawn(
     driver: MujocoDriver,
 ) -> None:
     async with running(driver) as (world, bus):
@@ -297,12 +301,12 @@ async def test_a_scene_that_cannot_be_drawn_is_said_and_a_good_one_is_drawn_agai
         broken = replace(world.scene, kinds=b"\xff" * len(world.scene.kinds))
         world.bus.publish(SIM_SCENE, broken)
         world.tick(15)
-        await until(lambda: "cannot be shown" in infos(world)[-1], "what is wrong")
-        assert bus.progress()  # it is no process that hangs
+        await until(lambda: "cannot be shown" in camera_problems(world)[-1], "what is wrong")
+        assert bus.progress()  # the process does not count as hanging
         world.bus.publish(SIM_SCENE, world.scene)
         await world.drive(16, 30)
         assert world.received["image"][-1].tick == 30
 
 
-def infos(world: Simulated) -> list[str]:
+def camera_problems(world: FakeDriver) -> list[str]:
     return [one.problem for one in world.received["camera"]]  # type: ignore[attr-defined]

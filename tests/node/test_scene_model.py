@@ -1,4 +1,4 @@
-"""A scene that was sent is drawn as it is in the simulation."""
+"""A scene from the bus is drawn as it is in the simulation."""
 
 from pathlib import Path
 
@@ -21,14 +21,14 @@ from gigabrain_schemas.sim import SimPoses, SimScene, Thing
 from gigabrain_zenoh.errors import ConfigError
 
 
-def live(body: str, world: str = "warehouse") -> tuple[Simulation, LiveWorld]:
+def make_world(body: str, world: str = "warehouse") -> tuple[Simulation, LiveWorld]:
     robot, driver = make_driver(body, Run(folder=Path(), world=world, seed=1))
-    one = Simulation(sim_body(robot, driver.options, driver.run), load_world(world, 1), 1)
-    return one, LiveWorld(one, world)
+    simulation = Simulation(sim_body(robot, driver.options, driver.run), load_world(world, 1), 1)
+    return simulation, LiveWorld(simulation, world)
 
 
-def sent(world: LiveWorld) -> tuple[SimScene, SimPoses]:
-    """The messages as they are on the wire."""
+def received_scene(world: LiveWorld) -> tuple[SimScene, SimPoses]:
+    """Return scene and poses after encoding and decoding."""
     (_, scene), (_, poses) = world.scene()
     wire = [msgspec.msgpack.encode(message) for message in (scene, poses)]
     return (
@@ -38,7 +38,7 @@ def sent(world: LiveWorld) -> tuple[SimScene, SimPoses]:
 
 
 def middles(model: mujoco.MjModel, data: mujoco.MjData, geoms: list[int]) -> NDArray[np.float64]:
-    """Places of shapes; of meshes the middle of their vertices, as their frames may differ."""
+    """Return the middles of shapes; for meshes that of their vertices, as frames may differ."""
     found = data.geom_xpos[geoms].copy()
     for row, geom in enumerate(geoms):
         if model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_MESH:
@@ -50,59 +50,59 @@ def middles(model: mujoco.MjModel, data: mujoco.MjData, geoms: list[int]) -> NDA
 
 
 @pytest.mark.parametrize("body", ["turtlebot3_waffle", "alpha"])
-def test_every_shape_is_where_the_simulation_has_it(body: str) -> None:
-    one, world = live(body)
+def test_every_shape_is_at_its_place_in_the_simulation(body: str) -> None:
+    simulation, world = make_world(body)
     for _ in range(100):
-        one.drive(0.2, 0.0, 0.5)
-        one.advance()
-    mujoco.mj_kinematics(one.model, one.data)
-    scene, poses = sent(world)
-    made = SceneModel(scene)
-    assert made.place(poses)
+        simulation.drive(0.2, 0.0, 0.5)
+        simulation.advance()
+    mujoco.mj_kinematics(simulation.model, simulation.data)
+    scene, poses = received_scene(world)
+    scene_model = SceneModel(scene)
+    assert scene_model.place(poses)
     drawn = [
         geom
-        for geom in range(one.model.ngeom)
-        if one.model.geom_group[geom] < 3
-        and (one.model.geom_matid[geom] >= 0 or one.model.geom_rgba[geom][3] > 0)
-        and not one.model.body(one.model.geom_bodyid[geom]).name.startswith("spare/")
+        for geom in range(simulation.model.ngeom)
+        if simulation.model.geom_group[geom] < 3
+        and (simulation.model.geom_matid[geom] >= 0 or simulation.model.geom_rgba[geom][3] > 0)
+        and not simulation.model.body(simulation.model.geom_bodyid[geom]).name.startswith("spare/")
     ]
-    ours = middles(one.model, one.data, drawn)
-    theirs = middles(made.model, made.data, list(range(made.model.ngeom)))
+    ours = middles(simulation.model, simulation.data, drawn)
+    theirs = middles(scene_model.model, scene_model.data, list(range(scene_model.model.ngeom)))
     assert len(ours) == len(theirs)
     apart = np.linalg.norm(ours[:, None] - theirs[None], axis=2)
     assert apart.min(axis=0).max() < 2e-3
     assert apart.min(axis=1).max() < 2e-3
-    assert made.robot_place() == pytest.approx(one.truth.pose()[:2], abs=1e-3)
+    assert scene_model.robot_place() == pytest.approx(simulation.truth.pose()[:2], abs=1e-3)
 
 
-def test_things_are_drawn_beside_the_model_with_their_size_and_place() -> None:
-    one, world = live("turtlebot3_waffle", "arena")
-    made = SceneModel(sent(world)[0])
-    one.things.add(Thing(x=2.5, y=2.5, size=(0.4, 0.2, 0.6), name="crate"))
-    one.things.add(Thing(kind="person", x=-2.5, y=-2.5))
-    scene, poses = sent(world)
-    assert made.update(scene)
-    assert made.place(poses)
-    renderer = mujoco.MjvScene(made.model, 100)
-    made.add_things(renderer)
+def test_added_things_are_drawn_with_their_size_and_place() -> None:
+    simulation, world = make_world("turtlebot3_waffle", "arena")
+    scene_model = SceneModel(received_scene(world)[0])
+    simulation.things.add(Thing(x=2.5, y=2.5, size=(0.4, 0.2, 0.6), name="crate"))
+    simulation.things.add(Thing(kind="person", x=-2.5, y=-2.5))
+    scene, poses = received_scene(world)
+    assert scene_model.update(scene)
+    assert scene_model.place(poses)
+    renderer = mujoco.MjvScene(scene_model.model, 100)
+    scene_model.add_things(renderer)
     assert renderer.ngeom == 4
     sizes = [renderer.geoms[i].size.round(3).tolist() for i in range(4)]
     places = [renderer.geoms[i].pos.round(3).tolist() for i in range(4)]
     assert [0.2, 0.1, 0.3] in [pytest.approx(size) for size in sizes]
     assert [0.25, 0.25, 0.6] in [pytest.approx(size) for size in sizes]
     assert [2.5, 2.5, 0.3] in [pytest.approx(place) for place in places]
-    one.things.remove("crate")
-    assert made.update(sent(world)[0])
+    simulation.things.remove("crate")
+    assert scene_model.update(received_scene(world)[0])
 
 
-def test_another_world_is_no_update_and_its_poses_are_not_taken() -> None:
-    made = SceneModel(sent(live("turtlebot3_waffle", "arena")[1])[0])
-    scene, poses = sent(live("turtlebot3_waffle", "house")[1])
-    assert not made.place(msgspec.structs.replace(poses, version=7))
-    assert not made.update(scene)
+def test_scene_and_poses_of_another_world_are_rejected() -> None:
+    scene_model = SceneModel(received_scene(make_world("turtlebot3_waffle", "arena")[1])[0])
+    scene, poses = received_scene(make_world("turtlebot3_waffle", "house")[1])
+    assert not scene_model.place(msgspec.structs.replace(poses, version=7))
+    assert not scene_model.update(scene)
 
 
-def test_a_scene_whose_numbers_name_nothing_is_refused() -> None:
+def test_a_scene_with_unknown_kinds_or_bodies_is_refused() -> None:
     scene = EXAMPLES["SimScene"]
     assert isinstance(scene, SimScene)
     assert [shape.kind for shape in shapes_of(scene)] == ["plane", "mesh", "box"]
@@ -113,10 +113,10 @@ def test_a_scene_whose_numbers_name_nothing_is_refused() -> None:
 
 @pytest.mark.parametrize("number", [np.inf, -np.inf, np.nan])
 @pytest.mark.parametrize("field", ["sizes", "places"])
-def test_a_shape_of_no_finite_size_or_place_is_refused(field: str, number: float) -> None:
+def test_a_shape_without_finite_size_and_place_is_refused(field: str, number: float) -> None:
     scene = EXAMPLES["SimScene"]
     values = np.frombuffer(getattr(scene, field), "<f4").copy()
-    for at in range(0, len(values), 3):  # of each kind of shape
+    for at in range(0, len(values), 3):  # one value of each shape
         changed = values.copy()
         changed[at] = number
         with pytest.raises(ConfigError, match="size or a place that is not finite"):
@@ -124,7 +124,7 @@ def test_a_shape_of_no_finite_size_or_place_is_refused(field: str, number: float
 
 
 @pytest.mark.parametrize("corner", [3, 2**31, 2**32 - 1])
-def test_a_mesh_whose_faces_name_no_vertex_is_refused(corner: int) -> None:
+def test_a_mesh_with_faces_at_unknown_vertices_is_refused(corner: int) -> None:
     scene = EXAMPLES["SimScene"]
     assert isinstance(scene, SimScene)
     faces = np.frombuffer(scene.meshes[0].faces, "<u4").copy()
@@ -134,16 +134,16 @@ def test_a_mesh_whose_faces_name_no_vertex_is_refused(corner: int) -> None:
         SceneModel(msgspec.structs.replace(scene, meshes=(wrong,)))
 
 
-def test_poses_that_are_not_finite_are_not_taken() -> None:
-    scene, poses = sent(live("turtlebot3_waffle", "arena")[1])
-    made = SceneModel(scene)
+def test_poses_that_are_not_finite_are_rejected() -> None:
+    scene, poses = received_scene(make_world("turtlebot3_waffle", "arena")[1])
+    scene_model = SceneModel(scene)
     values = np.frombuffer(poses.poses, "<f4").copy()
     values[3] = np.nan
-    assert made.place(poses)
-    assert not made.place(msgspec.structs.replace(poses, poses=values.tobytes()))
+    assert scene_model.place(poses)
+    assert not scene_model.place(msgspec.structs.replace(poses, poses=values.tobytes()))
 
 
-def test_a_scene_of_more_meshes_than_a_message_may_carry_shows_the_rest_as_boxes() -> None:
+def test_meshes_beyond_the_limit_of_a_message_are_shown_as_boxes() -> None:
     corners = "0 0 0 1 0 0 0 1 0 0 0 1"
     meshes = [f'<mesh name="m{n}" vertex="{corners}" scale=".1 .1 .1"/>' for n in range(1010)]
     geoms = [f'<geom type="mesh" mesh="m{n}" pos="{n} 0 0"/>' for n in range(1010)]
@@ -160,11 +160,11 @@ def test_a_scene_of_more_meshes_than_a_message_may_carry_shows_the_rest_as_boxes
 
 
 def test_a_picture_of_a_running_world_is_saved(tmp_path: Path) -> None:
-    scene, poses = sent(live("turtlebot3_waffle", "arena")[1])
-    made = SceneModel(scene)
-    made.place(poses)
+    scene, poses = received_scene(make_world("turtlebot3_waffle", "arena")[1])
+    scene_model = SceneModel(scene)
+    scene_model.place(poses)
     try:
-        made.save(tmp_path / "now.png")
+        scene_model.save(tmp_path / "now.png")
     except ConfigError as error:
         pytest.skip(str(error))
     assert (tmp_path / "now.png").read_bytes().startswith(b"\x89PNG")

@@ -29,13 +29,13 @@ FLAT = drawn(
 #..............#...............#
 ################################
 """
-)  # 8 x 3 m, two rooms
+)  # 8 x 3 m with two rooms
 CAMERA = Camera(name="front", width=320, height=240, field_of_view=1.047, depth=True)
 SIGHT_M, HALF_VIEW = 2.5, 0.45
 
 
-class Seeing(Plane):
-    """A body with a camera that recognises the objects in its view, like perception."""
+class CameraPlane(Plane):
+    """A body with a camera; it publishes the objects in its view, as perception does."""
 
     def __init__(self, *things: MapObject, tags: tuple[MapTag, ...] = (), **more: Any) -> None:
         super().__init__(FLAT, **more)
@@ -49,7 +49,7 @@ class Seeing(Plane):
         for one in self.things:
             if self._sees(one.x, one.y):
                 self.found[one.id] = one
-        for number in [one for one in self.found if not self._there(one)]:
+        for number in [one for one in self.found if not self._is_present(one)]:
             gone = self.found[number]
             if self._sees(gone.x, gone.y):
                 del self.found[number]
@@ -65,50 +65,50 @@ class Seeing(Plane):
                 own = Labels(labels=labels, boot=self.boot, tick=self.tick)
                 self.bench.send(LABELS, own, name=process)
 
-    def _there(self, number: int) -> bool:
+    def _is_present(self, number: int) -> bool:
         return any(one.id == number for one in self.things)
 
     def _sees(self, x: float, y: float) -> bool:
-        off = math.hypot(x - self.x, y - self.y)
+        distance = math.hypot(x - self.x, y - self.y)
         turn = math.remainder(math.atan2(y - self.y, x - self.x) - self.yaw, math.tau)
         steps = [k / 40 for k in range(40)]
         way = [(self.x + s * (x - self.x), self.y + s * (y - self.y)) for s in steps]
         clear = all(self.cells[int(b / CELL), int(a / CELL)] != 100 for a, b in way)
-        return off < SIGHT_M and abs(turn) < HALF_VIEW and clear
+        return distance < SIGHT_M and abs(turn) < HALF_VIEW and clear
 
-    def off(self, x: float, y: float) -> tuple[float, float]:
+    def distance_and_bearing(self, x: float, y: float) -> tuple[float, float]:
         turn = math.remainder(math.atan2(y - self.y, x - self.x) - self.yaw, math.tau)
         return math.hypot(x - self.x, y - self.y), abs(turn)
 
 
-def thing(number: int, x: float, y: float, label: str = "can") -> MapObject:
+def map_object(number: int, x: float, y: float, label: str = "can") -> MapObject:
     return MapObject(id=number, label=label, x=x, y=y, z=0.06, size=(0.07, 0.12), confidence=0.9)
 
 
 async def test_it_drives_to_a_known_can_and_faces_it() -> None:
-    async with Seeing(thing(3, 2.8, 1.2)) as plane:
+    async with CameraPlane(map_object(3, 2.8, 1.2)) as plane:
         await plane.go(2.0)
         reply = await plane.ask(GOAL, GoalRequest(object="can"))
         assert reply.text == "goal-1: can 3 is at (2.80, 1.20)"
         await plane.until("succeeded", seconds=60)
-        distance, turn = plane.off(2.8, 1.2)
+        distance, turn = plane.distance_and_bearing(2.8, 1.2)
         assert 0.25 < distance < 0.5
         assert turn < 0.25
         assert plane.status.done[0].reason.endswith("before can 3")
 
 
-async def test_it_looks_for_a_can_in_the_next_room() -> None:
-    async with Seeing(thing(3, 7.2, 0.6)) as plane:
+async def test_it_searches_the_next_room_for_a_can() -> None:
+    async with CameraPlane(map_object(3, 7.2, 0.6)) as plane:
         await plane.go(0.5)
         reply = await plane.ask(GOAL, GoalRequest(object="can"))
         assert reply.text == "goal-1: a can is not known yet; looking for it"
         await plane.until("succeeded", seconds=240)
-        assert plane.off(7.2, 0.6)[0] < 0.6
+        assert plane.distance_and_bearing(7.2, 0.6)[0] < 0.6
 
 
 @pytest.mark.slow
-async def test_a_search_without_a_can_fails_after_looking_everywhere() -> None:
-    async with Seeing(thing(3, 2.8, 1.2, "ball")) as plane:
+async def test_a_search_fails_after_looking_everywhere() -> None:
+    async with CameraPlane(map_object(3, 2.8, 1.2, "ball")) as plane:
         await plane.go(0.5)
         request = MissionRequest(mission="do: [{find: can}]")
         assert (await plane.ask(MISSION, request)).ok
@@ -118,29 +118,29 @@ async def test_a_search_without_a_can_fails_after_looking_everywhere() -> None:
         assert plane.travelled > 3.0
 
 
-async def test_it_faces_a_tag() -> None:
+async def test_it_drives_to_a_tag_and_faces_it() -> None:
     tag = MapTag(id=7, x=7.7, y=2.0, z=0.4, yaw=math.pi, size=0.16)
-    async with Seeing(tags=(tag,)) as plane:
+    async with CameraPlane(tags=(tag,)) as plane:
         await plane.go(2.0)
         assert (await plane.ask(GOAL, GoalRequest(tag=7))).ok
         await plane.until("succeeded", seconds=120)
         assert plane.x == pytest.approx(7.7 - 0.345, abs=0.1)
         assert plane.y == pytest.approx(2.0, abs=0.1)
-        assert plane.off(7.7, 2.0)[1] < 0.25
+        assert plane.distance_and_bearing(7.7, 2.0)[1] < 0.25
 
 
-async def test_a_can_carried_away_meanwhile_is_sought_elsewhere() -> None:
-    async with Seeing(thing(3, 2.8, 1.2)) as plane:
+async def test_a_can_moved_during_the_drive_is_searched_elsewhere() -> None:
+    async with CameraPlane(map_object(3, 2.8, 1.2)) as plane:
         await plane.go(2.0)
         await plane.ask(GOAL, GoalRequest(object="can"))
         await plane.go(2.0)
-        plane.things = [thing(4, 1.0, 2.5)]
+        plane.things = [map_object(4, 1.0, 2.5)]
         await plane.until("succeeded", seconds=120)
         assert plane.status.done[0].reason.endswith("before can 4")
 
 
-async def test_it_stands_with_a_reason_while_recognition_does_not_run() -> None:
-    async with Seeing(thing(3, 2.8, 1.2)) as plane:
+async def test_it_stands_with_a_reason_without_recognition() -> None:
+    async with CameraPlane(map_object(3, 2.8, 1.2)) as plane:
         plane.recognizing = False
         plane.things = []
         await plane.go(2.0)
@@ -163,7 +163,7 @@ async def test_a_search_without_cameras_is_refused_in_one_line() -> None:
 
 
 async def test_a_search_with_only_a_camera_on_the_arm_is_refused() -> None:
-    async with Seeing() as plane:
+    async with CameraPlane() as plane:
         plane.description = replace(ARMED, cameras=(WRIST,))
         await plane.go(0.5)
         reply = await plane.ask(GOAL, GoalRequest(object="can"))
@@ -171,8 +171,8 @@ async def test_a_search_with_only_a_camera_on_the_arm_is_refused() -> None:
         assert reply.text.startswith("the robot has no camera but on its arm; ")
 
 
-async def test_the_name_of_an_object_as_place_is_refused_with_the_right_command() -> None:
-    async with Seeing(thing(3, 2.8, 1.2)) as plane:
+async def test_an_object_name_given_as_place_is_refused_with_the_right_command() -> None:
+    async with CameraPlane(map_object(3, 2.8, 1.2)) as plane:
         await plane.go(2.0)
         reply = await plane.ask(GOAL, GoalRequest(place="can"))
         assert reply.text == ("no place is called 'can'; an object is: gigabrain goto --object can")

@@ -1,4 +1,4 @@
-"""An arm picks up what its depth camera sees: perception from pictures, and missions by that."""
+"""An arm picks up things that its depth camera sees: perception, and missions with its solids."""
 
 import functools
 from collections.abc import Iterator
@@ -32,24 +32,24 @@ ON_PEDESTAL = replace(SO101, arm=replace(SO101.arm, floor=-0.2))
 HOME = dict(zip((joint.name for joint in SO101.joints), SO101.arm.home, strict=True))
 CUBE = Box(x=0.2, y=0.12, half_x=0.015, half_y=0.015, top=0.03)
 BESIDE = Box(x=0.12, y=-0.15, half_x=0.02, half_y=0.01, top=0.03)
-ASIDE = (0.15, -0.16)
-BELOW_ITS_HAND = (0.17, 0.0)  # of an arm in its home posture
-PARTS = tuple(  # of it, at the edges of the picture: what they are taken for does not count
+BESIDE_ITS_HAND = (0.15, -0.16)
+BELOW_ITS_HAND = (0.17, 0.0)  # of the arm in home posture
+PARTS = tuple(  # of the cube, cut off by the picture's edges: their label does not count
     Detection(label="can", confidence=1.0, box=box, position=(0.21, 0.11, 0.015))
     for box in ((0, 50, 90, 99), (50, 0, 90, 99), (50, 50, 320, 99), (50, 50, 90, 240))
 )
 NAMED = Detection(label="cube", confidence=0.9, box=(90, 90, 99, 99), position=(0.21, 0.11, 0.015))
 
 
-class Eyes(NodeBench):
-    """Perception of a robot that is an arm with a camera above its table."""
+class ArmPerception(NodeBench):
+    """Perception of an arm with a camera above its table."""
 
     def __init__(self, model: str = MODEL) -> None:
         super().__init__(functools.partial(perception.run, PerceptionConfig(mapping="off")))
         self._model = model
 
     async def look(self, tick: int, *boxes: Box) -> None:
-        """Take a picture of boxes at a tick."""
+        """Publish a depth picture of boxes at a tick."""
         if tick == 1:
             await self.ready()
             self.send(BODY, body(SO101))
@@ -62,71 +62,71 @@ class Eyes(NodeBench):
         await self.clock.advance(0)
 
     def seen(self) -> tuple[SeenSolid, ...]:
-        """Return what was published last."""
+        """Return the solids that were published last."""
         return self.sent(SOLIDS)[-1].solids
 
 
-async def test_perception_publishes_what_stands_on_the_table_of_an_arm() -> None:
-    async with Eyes() as eyes:
+async def test_perception_publishes_the_solids_on_the_table_of_an_arm() -> None:
+    async with ArmPerception() as perceiving:
         for tick in (1, 11):
-            await eyes.look(tick, CUBE, BESIDE)
-        one, other = sorted(eyes.seen(), key=lambda one: -one.position[1])
+            await perceiving.look(tick, CUBE, BESIDE)
+        one, other = sorted(perceiving.seen(), key=lambda one: -one.position[1])
         assert one.position == pytest.approx((0.2, 0.12, 0.015), abs=0.003)
         assert one.size == pytest.approx((0.03, 0.03, 0.03), abs=0.004)
         assert sorted(other.size) == pytest.approx([0.02, 0.03, 0.04], abs=0.004)
-        eyes.send(DETECTIONS, Detections(
+        perceiving.send(DETECTIONS, Detections(
             camera="top", width=320, height=240, things=(NAMED, *PARTS),
             boot=BOOT, tick=11, basis=11,
         ))  # fmt: skip
         for tick in (21, 31, 41):
-            await eyes.look(tick, CUBE)
-        (left,) = eyes.seen()
+            await perceiving.look(tick, CUBE)
+        (left,) = perceiving.seen()
         assert (left.id, left.label) == (one.id, "cube")
 
 
-async def test_what_the_arm_itself_shows_or_hides_is_no_thing() -> None:
-    hand = Box(x=0.2, y=0.0, half_x=0.04, half_y=0.02, top=0.17, bottom=0.11)  # where its hand is
+async def test_the_arm_itself_and_things_hidden_by_it_are_no_solids() -> None:
+    hand = Box(x=0.2, y=0.0, half_x=0.04, half_y=0.02, top=0.17, bottom=0.11)  # at its hand
     hidden = Box(x=0.2, y=0.0, half_x=0.015, half_y=0.03, top=0.03)
-    async with Eyes() as eyes:
+    async with ArmPerception() as perceiving:
         for tick in (1, 11, 21):
-            await eyes.look(tick, hand, hidden)
-        assert eyes.seen() == ()
+            await perceiving.look(tick, hand, hidden)
+        assert perceiving.seen() == ()
 
 
-async def test_without_a_usable_model_of_the_arm_nothing_is_looked_for() -> None:
-    async with Eyes("<mujoco/>") as eyes:
+async def test_without_a_usable_arm_model_no_solids_are_published() -> None:
+    async with ArmPerception("<mujoco/>") as perceiving:
         for tick in (1, 11):
-            await eyes.look(tick, CUBE)
-        assert eyes.sent(SOLIDS) == []
+            await perceiving.look(tick, CUBE)
+        assert perceiving.sent(SOLIDS) == []
 
 
-class SeeingRig(Rig):
+class CameraRig(Rig):
     """An arm with a queue of tasks and a camera."""
 
     camera: ArmCamera
 
     def look(self) -> None:
-        """Have the camera take pictures."""
+        """Take pictures with the camera."""
         self.seen = self.camera.look(self.arm.state())
 
     def tick(self) -> None:
-        """Have 20 ms pass."""
+        """Advance by 20 ms."""
         self.seen = tuple(replace(one, age=one.age + TICK_S) for one in self.seen)
         super().tick()
 
 
 @pytest.fixture
-def rig(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[SeeingRig]:
-    made = SeeingRig(tmp_path, request.param)
+def rig(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[CameraRig]:
+    made = CameraRig(tmp_path, request.param)
     made.arm.description = SO101
     with closing(ArmCamera(SO101, MODEL, made.arm.simulation, 1)) as made.camera:
         yield made
 
 
-@pytest.mark.parametrize("rig", [ASIDE], indirect=True)
-def test_a_mission_picks_up_what_is_seen_and_puts_it_down(rig: SeeingRig) -> None:
+@pytest.mark.parametrize("rig", [BESIDE_ITS_HAND], indirect=True)
+def test_a_mission_picks_up_a_seen_thing_and_puts_it_down(rig: CameraRig) -> None:
     rig.look()
-    done = rig.carry_out(
+    done = rig.run_mission(
         "things: {cube: {box: [0.03, 0.03, 0.03]}}\n"
         "do: [{pick: cube}, {place: [0.14, 0.15, 0.015]}]"
     )
@@ -135,18 +135,18 @@ def test_a_mission_picks_up_what_is_seen_and_puts_it_down(rig: SeeingRig) -> Non
     assert (x, y) == pytest.approx((0.14, 0.15), abs=0.01)
 
 
-@pytest.mark.parametrize("rig", [ASIDE], indirect=True)
-def test_an_arm_on_a_pedestal_picks_up_what_is_seen_at_its_height(rig: SeeingRig) -> None:
+@pytest.mark.parametrize("rig", [BESIDE_ITS_HAND], indirect=True)
+def test_an_arm_on_a_pedestal_picks_up_a_seen_thing(rig: CameraRig) -> None:
     rig.look()
     rig.arm.description = ON_PEDESTAL
     (cube,) = rig.seen
     x, y, z = cube.position
-    rig.seen = (replace(cube, position=(x, y, z + 0.2), label="cube"),)  # from the floor
-    rig.carry_out("things: {cube: {label: cube}}\ndo: [{pick: cube}]")
+    rig.seen = (replace(cube, position=(x, y, z + 0.2), label="cube"),)  # z counts from the floor
+    rig.run_mission("things: {cube: {label: cube}}\ndo: [{pick: cube}]")
     assert rig.arm.thing()[2] > 0.03
 
 
-def test_an_arm_on_a_pedestal_is_known_at_its_height() -> None:
+def test_the_mask_of_an_arm_on_a_pedestal_is_raised() -> None:
     level, raised = ArmMask(MODEL, SO101), ArmMask(MODEL, ON_PEDESTAL)
     points = np.random.default_rng(1).uniform((-0.1, -0.2, 0.0), (0.3, 0.2, 0.3), (2000, 3))
     own = level.covers(points, HOME)
@@ -156,10 +156,10 @@ def test_an_arm_on_a_pedestal_is_known_at_its_height() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("rig", [BELOW_ITS_HAND], indirect=True)
-def test_a_thing_below_its_own_hand_is_seen_once_the_arm_is_out_of_the_way(rig: SeeingRig) -> None:
+def test_a_thing_hidden_by_its_hand_is_seen_after_the_arm_moved_away(rig: CameraRig) -> None:
     rig.look()
     assert rig.seen == ()
-    rig.give("things: {cube: {box: [0.03, 0.03, 0.03]}}\ndo: [{pick: cube}]")
+    rig.add_mission("things: {cube: {box: [0.03, 0.03, 0.03]}}\ndo: [{pick: cube}]")
     for _ in range(1500):
         rig.tick()
         if rig.queue.status.done:
@@ -171,17 +171,19 @@ def test_a_thing_below_its_own_hand_is_seen_once_the_arm_is_out_of_the_way(rig: 
     assert rig.arm.thing()[2] > 0.03
 
 
-@pytest.mark.parametrize("rig", [ASIDE], indirect=True)
-def test_what_is_nowhere_seen_fails_in_one_line(rig: SeeingRig) -> None:
-    done = rig.carry_out("things: {can: {label: can}}\ndo: [{pick: can}]")
+@pytest.mark.parametrize("rig", [BESIDE_ITS_HAND], indirect=True)
+def test_a_pick_of_an_unseen_thing_fails_in_one_line(rig: CameraRig) -> None:
+    done = rig.run_mission("things: {can: {label: can}}\ndo: [{pick: can}]")
     assert done.state == "failed"
     assert done.reason == "picking up can: can is not seen"
 
 
-@pytest.mark.parametrize("rig", [ASIDE], indirect=True)
-def test_what_is_seen_standing_where_it_was_is_not_in_the_gripper(rig: SeeingRig) -> None:
+@pytest.mark.parametrize("rig", [BESIDE_ITS_HAND], indirect=True)
+def test_a_thing_still_seen_at_its_place_is_not_in_the_gripper(rig: CameraRig) -> None:
     rig.look()
-    rig.give("things: {cube: {box: [0.03, 0.03, 0.03]}}\ndo: [{pick: cube}, {posture: home}]")
+    rig.add_mission(
+        "things: {cube: {box: [0.03, 0.03, 0.03]}}\ndo: [{pick: cube}, {posture: home}]"
+    )
     while rig.phases[-1:] != ["lift"]:
         rig.tick()
     (standing,) = rig.seen

@@ -1,4 +1,4 @@
-"""The MuJoCo driver, joined to the real brain over an in-memory network, in lock-step."""
+"""The MuJoCo driver alone: stops, sensors, reports and configuration errors."""
 
 import threading
 from pathlib import Path
@@ -16,7 +16,9 @@ from gigabrain_zenoh.errors import BodyLost, ConfigError, Unsupported
 WAFFLE = "turtlebot3_waffle"
 
 
-def make(speed: float = 100.0, seconds: float | None = None, **options: float) -> MujocoDriver:
+def make_waffle(
+    speed: float = 100.0, seconds: float | None = None, **options: float
+) -> MujocoDriver:
     run = Run(folder=Path(), world="arena", seed=0, speed=speed, seconds=seconds)
     robot, driver = catalog.make_driver(WAFFLE, run)
     assert isinstance(driver, MujocoDriver)
@@ -24,7 +26,7 @@ def make(speed: float = 100.0, seconds: float | None = None, **options: float) -
     return MujocoDriver(robot, changed, driver.run)
 
 
-async def test_a_report_reads_nothing_that_the_physics_is_at_work_on(
+async def test_a_report_does_not_read_the_simulation_outside_its_thread(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     readers, report = set[str](), Simulation.report
@@ -34,8 +36,8 @@ async def test_a_report_reads_nothing_that_the_physics_is_at_work_on(
         return report(simulation, robot, run)
 
     monkeypatch.setattr(Simulation, "report", account)
-    driver = make(seconds=1.0)
-    readers.clear()  # before there is a thread
+    driver = make_waffle(seconds=1.0)
+    readers.clear()  # forget reads before the thread starts
     async with driver:
         ticks = driver.ticks(Clock())
         for seconds in (0.02, 0.04):
@@ -45,8 +47,8 @@ async def test_a_report_reads_nothing_that_the_physics_is_at_work_on(
     assert readers == {"physics"}
 
 
-async def test_the_body_stops_by_itself_when_nobody_commands_it_for_150_ms() -> None:
-    driver = make(seconds=1.0)
+async def test_the_body_stops_150_ms_after_its_last_command() -> None:
+    driver = make_waffle(seconds=1.0)
     async with driver:
         ticks = driver.ticks(Clock())
         await anext(ticks)
@@ -60,8 +62,8 @@ async def test_the_body_stops_by_itself_when_nobody_commands_it_for_150_ms() -> 
         await ticks.aclose()  # type: ignore[attr-defined]
 
 
-async def test_stop_and_close_work_in_any_state_and_the_rest_wants_an_open_body() -> None:
-    driver = make()
+async def test_stop_and_close_work_in_any_state_and_other_calls_only_when_open() -> None:
+    driver = make_waffle()
     await driver.stop()
     await driver.close()
     await driver.close()
@@ -71,8 +73,8 @@ async def test_stop_and_close_work_in_any_state_and_the_rest_wants_an_open_body(
         await driver.set_base_velocity(0.1, 0.0, 0.0)
 
 
-async def test_it_says_which_sensors_it_has() -> None:
-    async with make() as driver:
+async def test_an_unknown_sensor_is_refused_with_the_known_ones() -> None:
+    async with make_waffle() as driver:
         assert await driver.get_sensor_data("scan") is not None
         with pytest.raises(Unsupported, match="imu, scan"):
             await driver.get_sensor_data("camera")
@@ -80,20 +82,20 @@ async def test_it_says_which_sensors_it_has() -> None:
             await driver.set_joint_position("arm", 1.0)
 
 
-def test_a_model_that_is_not_there_is_named(tmp_path: Path) -> None:
+def test_a_missing_model_file_is_named(tmp_path: Path) -> None:
     original = catalog.robot_path(WAFFLE).read_text()
     mine = tmp_path / "robot.yaml"
-    mine.write_text(original)  # its model.xml stays behind
+    mine.write_text(original)  # without its model.xml
     with pytest.raises(ConfigError, match=r"model\.xml: No such file"):
         catalog.make_driver(str(mine), Run(folder=Path(), world="arena"))
 
 
-def test_a_link_that_the_body_does_not_have_lists_those_that_it_has() -> None:
+def test_an_unknown_link_is_refused_with_the_known_ones() -> None:
     with pytest.raises(ConfigError, match="has no link 'real'; it has: sim"):
         catalog.make_driver("mock", Run(folder=Path(), link="real"))
 
 
-def test_an_option_of_the_simulator_that_does_not_exist_is_refused_with_its_line(
+def test_an_unknown_simulator_option_is_refused_with_its_line(
     tmp_path: Path,
 ) -> None:
     text = (

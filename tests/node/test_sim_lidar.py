@@ -1,4 +1,4 @@
-"""The simulated lidar: where it looks, what it does not see, and its noise."""
+"""The simulated lidar: directions of beams, range limits, and noise."""
 
 import math
 from importlib.resources import files
@@ -14,7 +14,7 @@ from gigabrain_drivers.sim.worlds import load_world
 from gigabrain_zenoh.errors import Unsupported
 
 EXACT = SimLidar(noise_m=0.0)
-MIDDLE = Pose(0.064, 0, 0)  # the lidar is 0.064 m behind the origin of the base
+LIDAR_AT_ORIGIN = Pose(0.064, 0, 0)  # the lidar is 0.064 m behind the origin of the base
 
 
 def waffle(lidar: SimLidar | None) -> SimBody:
@@ -22,19 +22,19 @@ def waffle(lidar: SimLidar | None) -> SimBody:
     return SimBody(model=model.read_text(), wheel_radius=0.033, wheel_separation=0.287, lidar=lidar)
 
 
-def room(half: float, *shapes: Shape, start: Pose = MIDDLE) -> World:
-    """A square room with the lidar in its middle."""
+def room(half: float, *shapes: Shape, start: Pose = LIDAR_AT_ORIGIN) -> World:
+    """Return a square room; by default the lidar starts in its middle."""
     return World(name="room", description="", half_x=half, half_y=half, shapes=shapes, start=start)
 
 
-def test_nothing_in_range_is_infinite_and_the_robot_does_not_see_itself() -> None:
+def test_beams_without_a_hit_are_infinite_and_the_robot_is_not_seen() -> None:
     scan = Simulation(waffle(SimLidar()), room(10), 0).scan()
     assert scan.shape == (360,)
     assert scan.dtype == np.float32
     assert np.isposinf(scan).all()
 
 
-def test_the_first_beam_looks_ahead_and_the_others_follow_counter_clockwise() -> None:
+def test_the_first_beam_points_ahead_and_the_others_follow_counter_clockwise() -> None:
     pillars = (Cylinder(2, 0, 0.1, 1), Cylinder(0, 1, 0.1, 1), Cylinder(-3, 0, 0.1, 1))
     scan = Simulation(waffle(EXACT), room(10, *pillars), 0).scan()
     assert scan[[0, 90, 180]] == pytest.approx([1.9, 0.9, 2.9], abs=1e-3)
@@ -66,7 +66,7 @@ def test_beams_beyond_range_are_infinite_and_all_others_agree_with_single_rays(s
 
 
 def _single_rays(simulation: Simulation) -> np.ndarray:
-    """The 360 ranges by one `mj_ray` each, without a cutoff."""
+    """Return the 360 ranges by one `mj_ray` each, without a cutoff."""
     model, data = simulation.model, simulation.data
     site = data.site("robot/lidar")
     groups, hit, ranges = np.array([1, 1, 0, 1, 1, 1], np.uint8), np.zeros(1, np.int32), []
@@ -76,7 +76,7 @@ def _single_rays(simulation: Simulation) -> np.ndarray:
     return np.array(ranges)
 
 
-def test_noise_is_gaussian_of_the_given_deviation_and_comes_from_the_seed() -> None:
+def test_noise_has_the_given_deviation_and_depends_on_the_seed() -> None:
     lidar = SimLidar(noise_m=0.02, beams=2000)
     exact = Simulation(waffle(SimLidar(noise_m=0.0, beams=2000)), room(1.5), 0).scan()
     error = Simulation(waffle(lidar), room(1.5), 0).scan() - exact
@@ -88,13 +88,13 @@ def test_noise_is_gaussian_of_the_given_deviation_and_comes_from_the_seed() -> N
     assert not np.array_equal(error, other)
 
 
-def test_something_nearer_than_the_least_range_is_not_reported_as_free() -> None:
+def test_an_obstacle_nearer_than_range_min_is_reported_at_range_min() -> None:
     near = SimLidar(range_min=1.0)
     scan = Simulation(waffle(near), room(3, Cylinder(0.6, 0, 0.1, 1)), 0).scan()
     assert scan[0] == 1.0
 
 
-def test_the_walking_person_is_seen_where_he_is_now() -> None:
+def test_a_walking_person_is_seen_at_the_present_place() -> None:
     world = World(
         name="street",
         description="",
@@ -111,6 +111,6 @@ def test_the_walking_person_is_seen_where_he_is_now() -> None:
     assert np.isposinf(simulation.scan()[[330, 30, 180]]).all()
 
 
-def test_a_body_without_a_lidar_says_so() -> None:
+def test_a_scan_without_a_lidar_is_refused() -> None:
     with pytest.raises(Unsupported, match="no lidar"):
         Simulation(waffle(None), room(3), 0).scan()

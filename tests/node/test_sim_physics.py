@@ -1,4 +1,4 @@
-"""The simulated bodies: driving, odometry, wear, and the same numbers from the same seed."""
+"""The simulated bodies: driving, odometry, wear, and repeatability by the seed."""
 
 import logging
 import math
@@ -39,7 +39,7 @@ def run(simulation: Simulation, seconds: float) -> None:
         simulation.advance()
 
 
-def test_the_bodies_have_the_sizes_of_their_data_sheets() -> None:
+def test_the_bodies_have_size_and_mass_of_their_data_sheets() -> None:
     for body, mass, footprint, lidar in (
         (waffle(), 1.81, (0.069, -0.197, 0.1535), (-0.064, 0.0, 0.155)),
         (burger(), 1.005, (0.037, -0.101, 0.089), (-0.032, 0.0, 0.172)),
@@ -93,7 +93,7 @@ def _turn(simulation: Simulation, radians: float) -> None:
     run(simulation, 0.3)
 
 
-def test_wheels_that_would_be_too_fast_slow_down_together() -> None:
+def test_a_twist_too_fast_for_the_wheels_is_scaled_down() -> None:
     simulation = Simulation(waffle(), room(), 0)
     linear_x, angular_z = simulation.command(0.26, 1.82)
     assert linear_x / angular_z == pytest.approx(0.26 / 1.82)
@@ -101,7 +101,7 @@ def test_wheels_that_would_be_too_fast_slow_down_together() -> None:
     assert simulation.command(-0.1, 0.0) == pytest.approx((-0.1, 0.0))
 
 
-def test_the_wheels_speed_up_no_faster_than_they_can() -> None:
+def test_wheel_acceleration_is_limited() -> None:
     body = replace(waffle(), max_wheel_acceleration=10.0)
     simulation = Simulation(body, room(), 0)
     simulation.command(0.2, 0.0)
@@ -129,7 +129,7 @@ def test_a_calibrated_wheel_radius_reports_the_true_speed() -> None:
     assert simulation.odometry().linear_x == pytest.approx(true_speed, rel=0.01)
 
 
-def test_at_rest_nothing_moves_and_the_imu_feels_gravity() -> None:
+def test_at_rest_nothing_moves_and_the_imu_measures_gravity() -> None:
     simulation = Simulation(waffle(), load_world("house", 4), 4)
     run(simulation, 5)
     assert simulation.odometry() == (0.0, 0.0, 0.0, 0.0, 0.0)
@@ -140,7 +140,7 @@ def test_at_rest_nothing_moves_and_the_imu_feels_gravity() -> None:
     assert sample.orientation == pytest.approx((0, 0, 0, 1), abs=0.005)
 
 
-def test_the_imu_feels_a_turn_from_the_heading_of_the_start() -> None:
+def test_the_imu_measures_the_heading_from_the_start() -> None:
     world = replace(room(), start=Pose(1, 2, 2.5))
     simulation = Simulation(waffle(), world, 0)
     simulation.command(0.0, 0.5)
@@ -159,7 +159,7 @@ def test_time_is_counted_in_whole_ticks() -> None:
     assert simulation.data.time == pytest.approx(1.23)
 
 
-def test_wheels_report_names_angle_speed_and_effort() -> None:
+def test_wheels_report_name_angle_speed_and_effort() -> None:
     simulation = Simulation(waffle(), room(), 0)
     simulation.command(0.165, 0.0)
     run(simulation, 2)
@@ -210,7 +210,7 @@ def test_the_same_seed_and_commands_give_the_same_bits() -> None:
 
 
 def _recording(seed: int) -> list[object]:
-    """Two seconds of driving in the warehouse, everything that a robot can sense."""
+    """Return all sensor values of two seconds of driving in the warehouse."""
     simulation = Simulation(waffle(), load_world("warehouse", 3), seed)
     record: list[object] = []
     for tick in range(200):
@@ -222,7 +222,7 @@ def _recording(seed: int) -> list[object]:
     return [*record, simulation.battery(), simulation.truth.pose()]
 
 
-def test_a_simulation_that_comes_apart_is_a_lost_body_and_leaves_no_file(
+def test_an_unstable_simulation_is_a_lost_body_and_leaves_no_file(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -235,29 +235,29 @@ def test_a_simulation_that_comes_apart_is_a_lost_body_and_leaves_no_file(
     assert any("QVEL" in record.getMessage() for record in caplog.records)
 
 
-def test_a_model_that_is_none_is_refused() -> None:
+def test_an_invalid_model_is_refused() -> None:
     with pytest.raises(ConfigError, match="MJCF"):
         Simulation(replace(waffle(), model="<mujoco><nonsense/></mujoco>"), room(), 0)
 
 
-def test_a_model_without_the_parts_that_are_driven_is_refused_by_their_names() -> None:
+def test_missing_parts_of_a_model_are_named() -> None:
     model = waffle().model.replace("wheel_left", "left_wheel").replace("lidar", "laser")
     with pytest.raises(ConfigError, match=r"no joint 'wheel_left_joint'.* no site 'lidar'"):
         Simulation(replace(waffle(), model=model), room(), 0)
 
 
-def test_looking_does_not_change_what_happens() -> None:
-    looking, blind = (Simulation(waffle(), load_world("warehouse", 3), 3) for _ in range(2))
+def test_scanning_does_not_change_the_simulation() -> None:
+    scanned, unscanned = (Simulation(waffle(), load_world("warehouse", 3), 3) for _ in range(2))
     for _ in range(200):
-        for simulation in (looking, blind):
+        for simulation in (scanned, unscanned):
             simulation.command(0.2, 0.2)
             simulation.advance()
-        looking.scan()
-    assert looking.truth.pose() == blind.truth.pose()
-    assert looking.imu() == blind.imu()
+        scanned.scan()
+    assert scanned.truth.pose() == unscanned.truth.pose()
+    assert scanned.imu() == unscanned.imu()
 
 
-def test_the_robot_model_leaves_the_options_to_the_world() -> None:
+def test_the_robot_model_does_not_change_the_options_of_the_world() -> None:
     model = compile_scene(waffle(), load_world("house", 0))
     assert model.opt.timestep == 0.005
     assert model.opt.cone == mujoco.mjtCone.mjCONE_ELLIPTIC

@@ -1,4 +1,4 @@
-"""Pictures: the file format, and what is said where nothing can be drawn."""
+"""Pictures: the file format, and the error where nothing can be drawn."""
 
 import struct
 import sys
@@ -20,7 +20,7 @@ def waffle() -> SimBody:
     return SimBody(model=model.read_text(), wheel_radius=0.033, wheel_separation=0.287)
 
 
-def test_a_png_holds_the_pixels_that_it_was_given() -> None:
+def test_a_png_contains_the_given_pixels() -> None:
     pixels = np.arange(2 * 3 * 3, dtype=np.uint8).reshape(2, 3, 3) * 13
     data = png(pixels)
     assert data[:8] == b"\x89PNG\r\n\x1a\n"
@@ -31,7 +31,7 @@ def test_a_png_holds_the_pixels_that_it_was_given() -> None:
     assert np.array_equal(np.cumsum(rows[:, 1:], axis=0, dtype=np.uint8), pixels.reshape(2, 9))
 
 
-def test_without_opengl_the_packages_to_install_are_named(
+def test_the_error_without_opengl_names_the_packages_to_install(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     monkeypatch.setitem(sys.modules, "mujoco.egl", None)
@@ -41,7 +41,7 @@ def test_without_opengl_the_packages_to_install_are_named(
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_robot_is_drawn_where_there_is_opengl(tmp_path: Path) -> None:
+def test_a_robot_is_drawn_with_opengl(tmp_path: Path) -> None:
     path = tmp_path / "pictures" / "robot.png"
     try:
         render(waffle(), load_world("house", 1), 1, path, 160, 90)

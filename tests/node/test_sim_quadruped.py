@@ -1,4 +1,4 @@
-"""The quadruped in MuJoCo: how it walks, judged by the truth, on estimates that are its own."""
+"""The quadruped in MuJoCo walks by its own estimates, and is judged by the true motion."""
 
 import math
 from collections.abc import Callable
@@ -32,7 +32,7 @@ def room(*shapes: Shape, half: float = 40.0) -> World:
 def walk(
     simulation: Simulation, seconds: float, command: Callable[[float], Twist]
 ) -> NDArray[np.float64]:
-    """True velocity (n, 3) less what was commanded, from the third second on."""
+    """Return true minus commanded velocity (n, 3) from the third second on."""
     errors = []
     for tick in range(round(seconds * 100)):
         twist = command(tick / 100)
@@ -56,7 +56,7 @@ def rms(values: NDArray[np.float64]) -> list[float]:
 
 
 @pytest.mark.slow
-def test_a_minute_at_03_metres_a_second_within_002_rms_and_without_a_fall() -> None:
+def test_it_walks_a_minute_at_0_3_m_s_within_0_02_rms_without_a_fall() -> None:
     simulation = Simulation(alpha(), room(), 0)
     errors = walk(simulation, 60, lambda _: Twist(0.3, 0.0, 0.0))
     forward, sideways, _ = rms(errors)
@@ -73,7 +73,7 @@ def test_a_minute_at_03_metres_a_second_within_002_rms_and_without_a_fall() -> N
     [Twist(-0.3, 0.0, 0.0), Twist(0.0, 0.15, 0.0), Twist(0.0, 0.0, 0.8), Twist(0.3, 0.1, -0.4)],
     ids=["backwards", "sideways", "turning", "all"],
 )
-def test_it_walks_any_way(twist: Twist) -> None:
+def test_it_walks_in_any_direction(twist: Twist) -> None:
     simulation = Simulation(alpha(), room(), 1)
     errors = walk(simulation, 8, lambda _: twist)
     forward, sideways, _ = rms(errors)
@@ -91,7 +91,7 @@ def test_it_follows_changing_commands_up_to_its_limits_without_a_fall() -> None:
     assert math.remainder(truth.yaw - odometry.yaw, math.tau) == pytest.approx(0, abs=0.05)
 
 
-def test_a_shove_from_the_side_does_not_throw_it_over() -> None:
+def test_a_push_from_the_side_does_not_make_it_fall() -> None:
     simulation = Simulation(alpha(), room(), 2)
     walk(simulation, 2, lambda _: Twist(0.3, 0.0, 0.0))
     simulation.data.qvel[1] += 0.5
@@ -110,7 +110,7 @@ def test_it_comes_to_rest_on_four_feet_and_stays_there() -> None:
     assert math.hypot(after.x - before.x, after.y - before.y) < 0.003
 
 
-def test_from_03_metres_a_second_it_stops_within_15_centimetres() -> None:
+def test_it_stops_from_0_3_m_s_within_15_cm() -> None:
     simulation = Simulation(alpha(), room(), 3)
     walk(simulation, 3, lambda _: Twist(0.3, 0.0, 0.0))
     before = simulation.truth.pose()
@@ -127,10 +127,10 @@ def test_from_03_metres_a_second_it_stops_within_15_centimetres() -> None:
         Twist(0.0, 0.0, -0.5),
         Twist(0.2, 0.08, 0.0),
     ],
-    ids=["ahead", "backwards", "sideways", "turning", "aslant"],
+    ids=["ahead", "backwards", "sideways", "turning", "diagonal"],
 )
-def test_on_any_foot_it_rests_in_truth_and_by_its_own_estimate_after_600_ms(twist: Twist) -> None:
-    for phase in (0.0, 0.07, 0.14, 0.21):  # [s], of a cycle of 0.28 s
+def test_it_rests_600_ms_after_a_stop_in_any_phase_of_its_gait(twist: Twist) -> None:
+    for phase in (0.0, 0.07, 0.14, 0.21):  # [s], within a gait cycle of 0.28 s
         simulation = Simulation(alpha(), room(), 0)
         walk(simulation, 1.2 + phase, lambda _: twist)
         walk(simulation, 0.6, lambda _: Twist(0.0, 0.0, 0.0))
@@ -149,7 +149,7 @@ def test_it_stands_at_the_height_of_its_gait() -> None:
     assert simulation.data.body("robot/base").xpos[2] == pytest.approx(0.262, abs=0.005)
 
 
-def test_thrown_over_it_goes_limp() -> None:
+def test_it_goes_limp_after_a_fall() -> None:
     simulation = Simulation(alpha(), room(), 0)
     for tick in range(200):
         simulation.data.qvel[3] = 8.0 if tick < 20 else simulation.data.qvel[3]
@@ -158,7 +158,7 @@ def test_thrown_over_it_goes_limp() -> None:
     assert max(abs(motor.effort) for motor in simulation.motors()) < 20
 
 
-def test_its_motors_are_named_and_warm_up_and_drain_the_battery() -> None:
+def test_its_motors_have_names_and_warm_up_and_drain_the_battery() -> None:
     simulation = Simulation(alpha(), room(), 0)
     walk(simulation, 3, lambda _: Twist(0.3, 0.0, 0.0))
     assert tuple(motor.name for motor in simulation.motors()) == JOINT_NAMES
@@ -169,7 +169,7 @@ def test_its_motors_are_named_and_warm_up_and_drain_the_battery() -> None:
     assert battery.voltage == pytest.approx(29.2, abs=0.2)
 
 
-def test_its_hull_and_its_footprint_hold_the_feet_wherever_they_are() -> None:
+def test_hull_and_footprint_contain_the_feet_during_any_motion() -> None:
     simulation = Simulation(alpha(), room(), 0)
     base, model, data = simulation.model.body("robot/base").id, simulation.model, simulation.data
     feet = [model.geom(f"robot/{name}_foot").id for name in
@@ -188,7 +188,7 @@ def test_its_hull_and_its_footprint_hold_the_feet_wherever_they_are() -> None:
     assert catalog.load_robot("alpha").footprint[0] == (0.28, 0.19)
 
 
-def test_walking_touches_nothing_and_a_wall_is_a_contact() -> None:
+def test_walking_is_no_contact_and_hitting_a_wall_is_one() -> None:
     simulation = Simulation(alpha(), room(Box(1.2, 0, 0.1, 2, 0.6)), 0)
     walk(simulation, 2, lambda _: Twist(0.2, 0.0, 0.0))
     assert simulation.truth.contacts == 0
@@ -197,7 +197,7 @@ def test_walking_touches_nothing_and_a_wall_is_a_contact() -> None:
     assert simulation.truth.min_clearance_m == 0.0
 
 
-def test_the_same_seed_gives_the_same_bits_and_another_seed_others() -> None:
+def test_equal_seeds_give_equal_bits_and_other_seeds_others() -> None:
     first, second, other = (_recording(seed) for seed in (3, 3, 4))
     assert first == second
     assert first != other
@@ -213,13 +213,13 @@ def _recording(seed: int) -> list[object]:
     return [*record, simulation.scan().tobytes(), simulation.truth.pose()]
 
 
-def test_a_model_without_legs_is_refused_by_the_names_of_what_is_missing() -> None:
+def test_missing_leg_parts_of_a_model_are_named() -> None:
     model = MODEL.replace("front_left_knee", "knie").replace("rear_right_contact", "touched")
     with pytest.raises(ConfigError, match=r"no joint 'front_left_knee'.*'rear_right_contact'"):
         Simulation(replace(alpha(), model=model), room(), 0)
 
 
-def test_a_base_on_wheels_does_not_walk() -> None:
+def test_a_wheeled_base_refuses_to_walk() -> None:
     from gigabrain_drivers.sim.body import SimBody
 
     waffle = (files("gigabrain_drivers") / "bodies" / "turtlebot3_waffle" / "model.xml").read_text()

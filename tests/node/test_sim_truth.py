@@ -1,4 +1,4 @@
-"""The truth about a run: contacts, clearance, and the person who keeps away."""
+"""The true record of a run: contacts, clearance and falls; persons keep their distance."""
 
 from dataclasses import replace
 from importlib.resources import files
@@ -25,7 +25,7 @@ def run(simulation: Simulation, seconds: float) -> None:
         simulation.advance()
 
 
-def test_a_push_against_a_wall_is_one_contact_and_the_bumper_feels_it() -> None:
+def test_pushing_against_a_wall_is_one_contact_and_sets_the_bumper() -> None:
     simulation = Simulation(waffle(), room(Box(0.6, 0, 0.1, 1, 0.5)), 0)
     assert simulation.truth.min_clearance_m == pytest.approx(0.5 - 0.069, abs=1e-3)
     simulation.command(0.2, 0.0)
@@ -45,7 +45,7 @@ def test_backing_off_and_touching_again_is_a_second_contact() -> None:
     assert simulation.truth.contacts == 2
 
 
-def test_passing_close_is_measured_to_a_millimetre_and_is_no_contact() -> None:
+def test_clearance_of_a_close_pass_is_exact_and_no_contact() -> None:
     simulation = Simulation(waffle(), room(Box(1.0, 0.3035, 0.1, 0.1, 0.5)), 0)
     simulation.command(0.26, 0.0)
     run(simulation, 6)
@@ -53,7 +53,7 @@ def test_passing_close_is_measured_to_a_millimetre_and_is_no_contact() -> None:
     assert simulation.truth.min_clearance_m == pytest.approx(0.05, abs=2e-3)
 
 
-def test_the_person_counts_as_a_contact_and_never_comes_nearer_by_himself() -> None:
+def test_hitting_a_person_is_a_contact_but_persons_keep_half_a_metre() -> None:
     path = ((3.0, 0.0), (-3.0, 0.0), (-3.0, 3.0), (3.0, 3.0))
     world = replace(room(), people=(WalkingPath(path),))
     standing = Simulation(waffle(), world, 0)
@@ -66,7 +66,7 @@ def test_the_person_counts_as_a_contact_and_never_comes_nearer_by_himself() -> N
 
 
 def with_pit(folder: Path, depth: float) -> World:
-    """A floor that ends half a metre ahead, and goes on lower."""
+    """Return a world whose floor continues lower from half a metre ahead."""
     path = folder / "pit.xml"
     path.write_text(
         "<mujoco><worldbody>"
@@ -87,7 +87,7 @@ def test_a_fall_down_a_step_is_counted_once_and_is_no_contact(tmp_path: Path, de
     assert (simulation.truth.falls, simulation.truth.contacts) == (1, 0)
 
 
-def test_driving_and_braking_hard_is_no_fall() -> None:
+def test_hard_driving_and_braking_is_no_fall() -> None:
     simulation = Simulation(waffle(), room(), 0)
     for speed in (0.26, -0.26, 0.26, 0.0):
         simulation.command(speed, 1.8)

@@ -1,4 +1,4 @@
-"""Worlds: names, safe starts, layouts in which nothing gets stuck, and the person."""
+"""Worlds: names, clear starts, layouts without traps, and walking persons."""
 
 import itertools
 import math
@@ -43,7 +43,7 @@ def test_a_mistyped_world_suggests_the_right_one() -> None:
 
 
 @pytest.mark.parametrize("name", ["random:abc", "random:", "random:-1", "random:1.5"])
-def test_a_random_world_without_a_whole_number_says_what_is_wanted(name: str) -> None:
+def test_a_random_world_without_a_whole_number_is_refused(name: str) -> None:
     with pytest.raises(UnknownName, match="random:SEED needs a whole number"):
         load_world(name, 0)
 
@@ -67,19 +67,19 @@ def test_the_seed_alone_decides_layout_and_start() -> None:
 
 
 @pytest.mark.parametrize("seed", range(6))
-def test_gaps_in_a_random_world_are_closed_or_wide_enough(seed: int) -> None:
+def test_no_gap_in_a_random_world_is_a_trap(seed: int) -> None:
     world = load_world(f"random:{seed}", 0)
     assert 10 <= len(world.shapes) <= 14
     assert all(gap < 0.2 or gap >= 1.1 for gap in _gaps(f"random:{seed}"))
 
 
-def test_gaps_in_arena_and_warehouse_are_closed_or_wide_enough() -> None:
+def test_no_gap_in_arena_and_warehouse_is_a_trap() -> None:
     assert min(gap for gap in _gaps("arena") if gap >= 0.2) >= 1.1
     assert min(gap for gap in _gaps("warehouse") if gap >= 0.2) >= 1.1
 
 
 def _gaps(name: str) -> list[float]:
-    """Every distance between two solid things, by MuJoCo."""
+    """Return the distances between all pairs of solid things [m], by MuJoCo."""
     model = world_spec(load_world(name, 0)).compile()
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
@@ -93,7 +93,7 @@ def _gaps(name: str) -> list[float]:
 
 
 @pytest.mark.parametrize("name", SOME_WORLDS)
-def test_decoration_hangs_above_every_robot_and_walls_stand_above_every_lidar(name: str) -> None:
+def test_shapes_reach_the_floor_or_hang_above_robots_and_rise_above_lidars(name: str) -> None:
     world = load_world(name, 0)
     for shape in world.everything():
         assert shape.bottom == 0 or shape.bottom >= 0.25
@@ -122,14 +122,14 @@ def test_a_closed_path_is_walked_by_arc_length_and_wraps() -> None:
     assert path.at(6.5) == pytest.approx((0.5, 0, 0))
 
 
-def test_the_person_walks_80_cm_in_a_second() -> None:
+def test_a_person_walks_80_cm_per_second() -> None:
     person = Person(WalkingPath(((0, 0), (10, 0), (10, 1), (0, 1)), start=0.0))
     for _ in range(100):
         person.advance(lambda x, y: 5.0)
     assert person.pose == pytest.approx((0.8, 0, 0))
 
 
-def test_the_person_stops_half_a_metre_from_the_robot_and_goes_on_when_it_is_gone() -> None:
+def test_a_person_stops_half_a_metre_before_the_robot_until_it_is_gone() -> None:
     person = Person(WalkingPath(((0, 0), (10, 0), (10, 1), (0, 1)), start=0.0))
     for _ in range(1000):
         person.advance(lambda x, y: math.hypot(x - 3.0, y))
@@ -140,14 +140,14 @@ def test_the_person_stops_half_a_metre_from_the_robot_and_goes_on_when_it_is_gon
     assert person.pose.x > 3.0
 
 
-def test_the_person_may_walk_away_from_a_robot_that_came_too_close() -> None:
+def test_a_person_may_walk_away_from_a_robot_that_is_too_close() -> None:
     person = Person(WalkingPath(((0, 0), (10, 0), (10, 1), (0, 1)), start=1.0))
     for _ in range(100):
         person.advance(lambda x, y: math.hypot(x - 0.6, y))
     assert person.pose.x == pytest.approx(1.8)
 
 
-def test_standing_for_the_robot_counts_once_until_the_person_has_walked_on() -> None:
+def test_each_stop_of_a_person_for_the_robot_counts_once() -> None:
     person = Person(WalkingPath(((0, 0), (10, 0), (10, 1), (0, 1)), start=0.0))
     for _ in range(100):
         person.advance(lambda x, y: max(0.0, 1.0 - x))

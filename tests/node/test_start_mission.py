@@ -1,4 +1,4 @@
-"""The start mission of a robot: places of the map, and refusals."""
+"""The start mission of a robot: it waits for the places of the map, or is refused."""
 
 import math
 from pathlib import Path
@@ -15,7 +15,7 @@ from tests.node.plane import ROOM, Plane, drawn
 CELLS = drawn(ROOM)
 
 
-def begins_with(folder: Path, text: str) -> Plane:
+def plane_with_mission(folder: Path, text: str) -> Plane:
     """Return a robot with a start mission."""
     file = folder / "first.yaml"
     file.write_text(text)
@@ -23,30 +23,30 @@ def begins_with(folder: Path, text: str) -> Plane:
     return Plane(CELLS, config=DecisionConfig(behaviour="navigate", settings=settings))
 
 
-def send(plane: Plane, *names: str) -> None:
+def send_places(plane: Plane, *names: str) -> None:
     places = tuple(Place(name=name, x=1.5, y=1.2) for name in names)
     plane.bench.send(ZONES, Zones(places=places, boot=plane.boot, tick=plane.tick))
 
 
-async def test_it_waits_for_the_places_of_the_map_and_drives_there(tmp_path: Path) -> None:
-    async with begins_with(tmp_path, "do: [{goto: kitchen}]") as plane:
+async def test_a_start_mission_waits_for_the_places_of_the_map(tmp_path: Path) -> None:
+    async with plane_with_mission(tmp_path, "do: [{goto: kitchen}]") as plane:
         await plane.go(0.5)
         assert plane.intent.reason == (
             "waiting: for the body and the map's places, to begin its mission"
         )
-        send(plane, "kitchen")
+        send_places(plane, "kitchen")
         await plane.until("succeeded", seconds=60)
         assert math.dist((plane.x, plane.y), (1.5, 1.2)) < 0.15
         task = plane.status.done[0]
         assert (task.label, task.source) == ("first", "itself")
 
 
-async def test_a_task_ends_the_wait_for_places(tmp_path: Path) -> None:
-    async with begins_with(tmp_path, "do: [{goto: kitchen}]") as plane:
+async def test_another_task_cancels_a_waiting_start_mission(tmp_path: Path) -> None:
+    async with plane_with_mission(tmp_path, "do: [{goto: kitchen}]") as plane:
         await plane.go(0.5)
         assert (await plane.ask(GOAL, GoalRequest(x=1.5, y=1.2))).goal == "goal-1"
         await plane.until("succeeded", seconds=60)
-        send(plane, "kitchen")
+        send_places(plane, "kitchen")
         await plane.go(0.5)
         assert plane.intent.reason == NO_GOAL.reason
 
@@ -63,8 +63,8 @@ async def test_a_task_ends_the_wait_for_places(tmp_path: Path) -> None:
 async def test_an_impossible_start_mission_is_refused_in_one_line(
     tmp_path: Path, caplog: pytest.LogCaptureFixture, step: str, why: str
 ) -> None:
-    async with begins_with(tmp_path, f"do:\n- {step}") as plane:
-        send(plane, "kitchen")
+    async with plane_with_mission(tmp_path, f"do:\n- {step}") as plane:
+        send_places(plane, "kitchen")
         await plane.go(0.5)
         assert plane.intent.reason == NO_GOAL.reason
         assert plane.status.current is None

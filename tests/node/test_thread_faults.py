@@ -1,4 +1,4 @@
-"""An exception in a thread, or in a handler of messages, ends its process."""
+"""An exception in a thread or in a message handler ends its process."""
 
 import asyncio
 from collections.abc import Callable
@@ -25,8 +25,8 @@ WAFFLE = "turtlebot3_waffle"
 PATIENCE_S = 20.0
 
 
-def broken_at(monkeypatch: pytest.MonkeyPatch, step: int) -> None:
-    """Have the physics raise in this step."""
+def raise_at_step(monkeypatch: pytest.MonkeyPatch, step: int) -> None:
+    """Let the physics raise in the given step."""
     advance, steps = Simulation.advance, iter(range(1, 1_000_000))
 
     def advance_or_raise(simulation: Simulation) -> None:
@@ -41,7 +41,7 @@ def broken_at(monkeypatch: pytest.MonkeyPatch, step: int) -> None:
 async def test_a_physics_step_that_raises_ends_the_driver(
     step: int, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    broken_at(monkeypatch, step)
+    raise_at_step(monkeypatch, step)
     robot, driver = catalog.make_driver(WAFFLE, Run(folder=Path()))
     assert isinstance(driver, MujocoDriver)
     config = DriverConfig(body=WAFFLE, state_dir=str(tmp_path))
@@ -52,7 +52,7 @@ async def test_a_physics_step_that_raises_ends_the_driver(
     assert "mj_step: divided by zero" in str(ended.value.exceptions[0])
 
 
-async def test_a_scan_that_raises_ends_the_driver_too(
+async def test_a_scan_that_raises_ends_the_driver(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     robot, driver = catalog.make_driver(WAFFLE, Run(folder=Path()))
@@ -67,9 +67,11 @@ async def test_a_scan_that_raises_ends_the_driver_too(
         await asyncio.wait_for(node, PATIENCE_S)
 
 
-async def test_physics_that_raises_ends_the_emulator(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Its process watches `lost`, and ends with what it says."""
-    broken_at(monkeypatch, 5)
+async def test_an_exception_of_the_physics_sets_lost_in_the_emulator(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The emulator's process ends with the text in `lost`."""
+    raise_at_step(monkeypatch, 5)
     body = emulated_body(WAFFLE, Run(folder=Path()))
     body.start()
     try:
@@ -79,7 +81,7 @@ async def test_physics_that_raises_ends_the_emulator(monkeypatch: pytest.MonkeyP
         await body.close()
 
 
-async def test_a_handler_that_raises_ends_a_process_that_waits_for_other_things(
+async def test_a_handler_that_raises_ends_an_otherwise_waiting_process(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     network = LocalNetwork()

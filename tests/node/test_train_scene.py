@@ -1,4 +1,4 @@
-"""Rendered pictures of the training sets, and what is said to be in them."""
+"""Rendered pictures of the training sets, and their labels."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -24,23 +24,23 @@ def studio() -> Iterator[Studio]:
     made.close()
 
 
-def put(studio: Studio, label: str, x: float, y: float) -> int:
-    """Put the first thing of a class somewhere; return its number."""
+def place_thing(studio: Studio, label: str, x: float, y: float) -> int:
+    """Move the first thing of a class to (x, y); return its number."""
     number = next(n for n, thing in enumerate(studio.things) if thing.look.label == label)
     studio.data.mocap_pos[studio.things[number].mocap] = (x, y, 0)
     return number
 
 
 def look_ahead(studio: Studio) -> None:
-    """Put the camera at the middle, 0.2 m high, looking along x."""
+    """Put the camera at the origin, 0.2 m high, looking along x."""
     studio.model.cam_pos[0], studio.model.cam_fovy[0] = (0, 0, 0.2), 45
     studio.model.cam_quat[0] = (0.5, 0.5, -0.5, -0.5)
     mujoco.mj_kinematics(studio.model, studio.data)
     mujoco.mj_camlight(studio.model, studio.data)
 
 
-def test_what_is_farther_left_is_seen_farther_left(studio: Studio) -> None:
-    left, right = put(studio, "ball", 2, 0.5), put(studio, "cube", 2, -0.5)
+def test_a_thing_farther_left_is_farther_left_in_the_picture(studio: Studio) -> None:
+    left, right = place_thing(studio, "ball", 2, 0.5), place_thing(studio, "cube", 2, -0.5)
     look_ahead(studio)
     studio.show([studio.things[left], studio.things[right]])
     owners = studio.owners()
@@ -48,8 +48,8 @@ def test_what_is_farther_left_is_seen_farther_left(studio: Studio) -> None:
     assert columns[left].max() < 160 < columns[right].min()
 
 
-def test_a_thing_behind_another_is_seen_only_in_part(studio: Studio) -> None:
-    front, back = put(studio, "robot", 1.0, 0.0), put(studio, "charger", 1.6, 0.2)
+def test_a_thing_behind_another_is_partly_hidden(studio: Studio) -> None:
+    front, back = place_thing(studio, "robot", 1.0, 0.0), place_thing(studio, "charger", 1.6, 0.2)
     look_ahead(studio)
     studio.show([studio.things[front], studio.things[back]])
     seen = int((studio.owners() == back).sum())
@@ -57,8 +57,8 @@ def test_a_thing_behind_another_is_seen_only_in_part(studio: Studio) -> None:
     assert 0 < seen < int((studio.owners() == back).sum())
 
 
-def test_what_is_painted_plain_has_no_texture(studio: Studio) -> None:
-    number = put(studio, "cube", 1.0, 0.0)
+def test_plain_paint_has_no_texture(studio: Studio) -> None:
+    number = place_thing(studio, "cube", 1.0, 0.0)
     look_ahead(studio)
     thing = studio.things[number]
     studio.show([thing], room=False)
@@ -71,8 +71,8 @@ def test_what_is_painted_plain_has_no_texture(studio: Studio) -> None:
     assert kinds[0] < 10 < kinds[1]
 
 
-def test_a_door_is_not_the_wall_around_it(studio: Studio) -> None:
-    door = put(studio, "door", 3.0, 0.0)
+def test_the_label_of_a_door_excludes_its_wall(studio: Studio) -> None:
+    door = place_thing(studio, "door", 3.0, 0.0)
     thing = studio.things[door]
     look_ahead(studio)
     studio.show([thing])
@@ -80,7 +80,7 @@ def test_a_door_is_not_the_wall_around_it(studio: Studio) -> None:
     assert (studio.owners() == door).any(axis=0).sum() < 160
 
 
-def test_drawn_scenes_have_things_and_their_boxes_are_inside_the_picture(studio: Studio) -> None:
+def test_scenes_have_labelled_things_with_boxes_inside_the_picture(studio: Studio) -> None:
     rng = np.random.default_rng(8)
     counted = 0
     for _ in range(6):
@@ -98,7 +98,7 @@ def test_drawn_scenes_have_things_and_their_boxes_are_inside_the_picture(studio:
     assert counted >= 6
 
 
-def test_a_set_is_the_same_each_time_and_is_kept(tmp_path: Path) -> None:
+def test_a_picture_set_is_repeatable_and_not_rendered_twice(tmp_path: Path) -> None:
     first, second = tmp_path / "a", tmp_path / "b"
     try:
         for folder in (first, second):

@@ -1,4 +1,4 @@
-"""Worlds of one's own: YAML, ROS maps and MJCF become geometry; what cannot be is refused."""
+"""A user's own worlds: YAML, ROS maps and MJCF become geometry; invalid ones are refused."""
 
 import math
 import struct
@@ -48,7 +48,7 @@ MODEL = """<mujoco><worldbody>
 </worldbody></mujoco>"""
 
 
-def written(path: Path, text: str) -> str:
+def write_file(path: Path, text: str) -> str:
     path.write_text(text)
     return str(path)
 
@@ -59,8 +59,8 @@ def simulated(world: str, seed: int = 0) -> Simulation:
     return Simulation(sim_body(robot, driver.options, driver.run), load_world(world, seed), seed)
 
 
-def test_a_world_file_is_made_into_walls_with_doors_boxes_and_people(tmp_path: Path) -> None:
-    world = load_world(written(tmp_path / "room.yaml", ROOM), 3)
+def test_a_world_file_gives_walls_with_doors_boxes_and_persons(tmp_path: Path) -> None:
+    world = load_world(write_file(tmp_path / "room.yaml", ROOM), 3)
     left, between, leaf, right, box, shelf, pillar = world.shapes
     assert isinstance(left, Box)
     assert (left.x, left.half_x, left.half_y, left.height) == (-2.5, 0.5, 0.05, 1.0)
@@ -75,16 +75,16 @@ def test_a_world_file_is_made_into_walls_with_doors_boxes_and_people(tmp_path: P
     assert all(0 <= walk.start <= 4.0 for walk in world.people)
 
 
-def test_a_slanting_wall_lies_between_its_ends(tmp_path: Path) -> None:
+def test_a_slanted_wall_lies_between_its_ends(tmp_path: Path) -> None:
     text = "size: [9, 9]\nwalls:\n  - {from: [0, 0], to: [3, 4], thickness: 0.2}\n"
-    (wall,) = load_world(written(tmp_path / "slant.yaml", text), 0).shapes
+    (wall,) = load_world(write_file(tmp_path / "slant.yaml", text), 0).shapes
     assert wall.distance(1.5, 2.0) == 0.0
     assert wall.distance(3.4, 4.0) == pytest.approx(math.hypot(0.24, 0.22))
     assert wall.distance(0.8, -0.6) == pytest.approx(0.9)
 
 
-def test_a_robot_drives_in_it_among_all_its_people(tmp_path: Path) -> None:
-    simulation = simulated(written(tmp_path / "room.yaml", ROOM))
+def test_all_persons_of_a_world_file_walk(tmp_path: Path) -> None:
+    simulation = simulated(write_file(tmp_path / "room.yaml", ROOM))
     before = [pose.pose for pose in simulation.people()]
     for _ in range(50):
         simulation.advance()
@@ -122,56 +122,56 @@ def test_a_robot_drives_in_it_among_all_its_people(tmp_path: Path) -> None:
 )
 def test_a_bad_world_file_is_refused_in_one_line(text: str, complaint: str, tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=complaint) as raised:
-        load_world(written(tmp_path / "bad.yaml", text), 0)
+        load_world(write_file(tmp_path / "bad.yaml", text), 0)
     assert "\n" not in str(raised.value)
 
 
 def test_a_start_within_a_box_is_refused(tmp_path: Path) -> None:
     text = "size: [6, 4]\nstart: [0, 0, 0]\nboxes:\n  - {at: [0, 0], size: [1, 1, 1]}\n"
     with pytest.raises(ConfigError, match=r"full.yaml:2: the robot touches something at its start"):
-        simulated(written(tmp_path / "full.yaml", text))
+        simulated(write_file(tmp_path / "full.yaml", text))
 
 
 @pytest.mark.parametrize("place", ["50, 0", "0, -2.1"])
 def test_a_start_outside_the_walls_is_refused(place: str, tmp_path: Path) -> None:
-    world = written(tmp_path / "small.yaml", f"size: [6, 4]\nstart: [{place}, 0]\n")
+    world = write_file(tmp_path / "small.yaml", f"size: [6, 4]\nstart: [{place}, 0]\n")
     expected = r"small.yaml:2: .* outside its walls.* x from -3 to 3, and y from -2 to 2"
     with pytest.raises(ConfigError, match=expected):
         load_world(world, 0)
-    assert load_world(written(Path(world), Path(world).read_text() + "outer_walls: false\n"), 0)
+    assert load_world(write_file(Path(world), Path(world).read_text() + "outer_walls: false\n"), 0)
 
 
 @pytest.mark.parametrize("head", ["", '<?xml version="1.0"?>\n<!-- <mujoco> -->\n'])
-def test_a_urdf_is_no_world(head: str, tmp_path: Path) -> None:
-    world = written(tmp_path / "x.xml", f'{head}<robot name="x"/>\n')
+def test_a_urdf_is_refused_as_world(head: str, tmp_path: Path) -> None:
+    world = write_file(tmp_path / "x.xml", f'{head}<robot name="x"/>\n')
     line = head.count("\n") + 1
     with pytest.raises(ConfigError, match=rf"x.xml:{line}: a URDF; expected an MJCF model"):
         load_world(world, 0)
 
 
-def test_a_model_without_room_names_its_file(tmp_path: Path) -> None:
+def test_a_model_without_space_for_the_robot_is_refused(tmp_path: Path) -> None:
     text = '<mujoco><worldbody><geom type="box" size="1.5 1.5 0.5"/></worldbody></mujoco>'
     with pytest.raises(ConfigError, match=r"full.xml:1: found no place for the robot"):
-        load_world(written(tmp_path / "full.xml", text), 0)
+        load_world(write_file(tmp_path / "full.xml", text), 0)
 
 
 @pytest.mark.parametrize("part", WorldFile.__struct_fields__)
-def test_every_part_refuses_a_value_of_another_kind(part: str, tmp_path: Path) -> None:
+def test_every_field_refuses_a_value_of_another_type(part: str, tmp_path: Path) -> None:
     other = "{a: [b]}" if part != "materials" else "[1]"
     text = f"{part}: {other}\n" + ("" if part == "size" else "size: [6, 4]\n")
     with pytest.raises(ConfigError, match=r"bad.yaml:1: "):
-        load_world(written(tmp_path / "bad.yaml", text), 0)
+        load_world(write_file(tmp_path / "bad.yaml", text), 0)
 
 
-def test_a_deployment_finds_its_world_beside_itself(tmp_path: Path) -> None:
-    written(tmp_path / "robot.yaml", "world: ./room.yaml\n")
+def test_a_deployment_finds_a_world_in_its_own_folder(tmp_path: Path) -> None:
+    write_file(tmp_path / "robot.yaml", "world: ./room.yaml\n")
     assert load_deployment(tmp_path / "robot.yaml").world == str(tmp_path / "room.yaml")
-    written(tmp_path / "robot.yaml", "world: house\n")
+    write_file(tmp_path / "robot.yaml", "world: house\n")
     assert load_deployment(tmp_path / "robot.yaml").world == "house"
 
 
 def grid(tmp_path: Path, ending: str = "png") -> Path:
-    """A room of 4 x 3 m with a pillar, as an image and a map's YAML file."""
+    """Write a map of a 4 x 3 m room with a pillar, as image and YAML; return the image's path."""
     grey = np.full((60, 80), 254, np.uint8)
     grey[[0, -1]] = grey[:, [0, -1]] = 0
     grey[20:25, 50:54] = 0
@@ -180,12 +180,12 @@ def grid(tmp_path: Path, ending: str = "png") -> Path:
     pgm = b"P5\n80 60\n255\n" + grey.tobytes()
     image.write_bytes(pgm if ending == "pgm" else png(np.dstack([grey] * 3)))
     about = f"image: {image.name}\nresolution: 0.05\norigin: [-1, -0.5, 0]\n"
-    written(tmp_path / "room.yaml", about)
+    write_file(tmp_path / "room.yaml", about)
     return image
 
 
 @pytest.mark.parametrize("ending", ["png", "pgm"])
-def test_a_map_of_ros_is_extruded_where_it_is_occupied(ending: str, tmp_path: Path) -> None:
+def test_occupied_cells_of_a_ros_map_become_walls(ending: str, tmp_path: Path) -> None:
     world = load_world(str(grid(tmp_path, ending)), 0)
     assert len(world.shapes) == 5
     pillar = min(world.shapes, key=lambda one: math.hypot(one.x - 1.6, one.y - 1.375))
@@ -197,7 +197,7 @@ def test_a_map_of_ros_is_extruded_where_it_is_occupied(ending: str, tmp_path: Pa
     assert np.isfinite(simulation.scan()[[0, 90, 180, 270]]).all()
 
 
-def test_a_start_is_where_the_map_is_free(tmp_path: Path) -> None:
+def test_a_random_start_is_in_free_space_of_the_map(tmp_path: Path) -> None:
     path = str(grid(tmp_path).with_suffix(".yaml"))
     for seed in range(20):
         world = load_world(path, seed)
@@ -210,28 +210,28 @@ def test_a_world_file_adds_to_a_map(tmp_path: Path) -> None:
     text = (
         "map: room.yaml\nwall_height: 0.8\ncylinders:\n  - {at: [0, 1], radius: 0.1, height: 1}\n"
     )
-    world = load_world(written(tmp_path / "more.yaml", text), 0)
+    world = load_world(write_file(tmp_path / "more.yaml", text), 0)
     assert len(world.shapes) == 6
     assert {shape.height for shape in world.shapes} == {0.8, 1.0}
 
 
-def test_a_map_without_outer_walls_has_none(tmp_path: Path) -> None:
+def test_outer_walls_of_a_map_can_be_left_out(tmp_path: Path) -> None:
     grid(tmp_path)
-    world = load_world(written(tmp_path / "open.yaml", "map: room.yaml\nouter_walls: false\n"), 0)
+    world = load_world(
+        write_file(tmp_path / "open.yaml", "map: room.yaml\nouter_walls: false\n"), 0
+    )
     assert world.walls() == ()
     assert len(world.shapes) == 5
 
 
 @pytest.mark.parametrize("group", range(6))
-def test_the_lidar_sees_what_a_model_may_be_bumped_into_in_any_group(
-    group: int, tmp_path: Path
-) -> None:
+def test_the_lidar_sees_solid_geoms_of_any_group(group: int, tmp_path: Path) -> None:
     text = MODEL.replace('type="box"', f'type="box" group="{group}"')
-    ranges = simulated(written(tmp_path / "hall.xml", text)).scan()
+    ranges = simulated(write_file(tmp_path / "hall.xml", text)).scan()
     assert np.isfinite(ranges).mean() > 0.5
 
 
-def test_merged_cells_cover_exactly_what_is_occupied() -> None:
+def test_merged_cells_cover_exactly_the_occupied_ones() -> None:
     random = np.random.default_rng(4)
     for share in (0.1, 0.5, 0.9):
         cells = random.random((40, 30)) < share
@@ -243,7 +243,7 @@ def test_merged_cells_cover_exactly_what_is_occupied() -> None:
 
 
 def image(width: int, height: int, rows: bytes) -> bytes:
-    """A grey PNG whose header and content need not agree."""
+    """Return a grey PNG whose header and content may disagree."""
     header = struct.pack(">IIBBBBB", width, height, 8, 0, 0, 0, 0)
     parts = ((b"IHDR", header), (b"IDAT", zlib.compress(rows)), (b"IEND", b""))
     return b"\x89PNG\r\n\x1a\n" + b"".join(
@@ -268,7 +268,7 @@ def test_a_bad_png_is_refused(data: bytes, complaint: str) -> None:
         read_png(data, "map.png", 8_000_000)
 
 
-def test_a_png_comes_back_as_it_was_written() -> None:
+def test_a_written_png_is_read_back_unchanged() -> None:
     colours: NDArray[np.uint8] = np.random.default_rng(0).integers(0, 256, (5, 7, 3), np.uint8)
     assert np.array_equal(read_png(png(colours), "x", 100), colours.mean(axis=2).round())
 
@@ -284,7 +284,7 @@ def test_a_png_comes_back_as_it_was_written() -> None:
 def test_a_bad_map_is_refused(about: str, complaint: str, tmp_path: Path) -> None:
     grid(tmp_path)
     with pytest.raises(ConfigError, match=complaint):
-        load_world(written(tmp_path / "bad.yaml", about), 0)
+        load_world(write_file(tmp_path / "bad.yaml", about), 0)
 
 
 def test_a_map_of_noise_is_refused(tmp_path: Path) -> None:
@@ -292,62 +292,62 @@ def test_a_map_of_noise_is_refused(tmp_path: Path) -> None:
     (tmp_path / "noise.png").write_bytes(png(np.dstack([noise] * 3)))
     about = "image: noise.png\nresolution: 0.05\norigin: [0, 0, 0]\n"
     with pytest.raises(ConfigError, match="need more than 4000 boxes"):
-        load_world(written(tmp_path / "noise.yaml", about), 0)
+        load_world(write_file(tmp_path / "noise.yaml", about), 0)
 
 
 def test_an_mjcf_model_is_a_world(tmp_path: Path) -> None:
-    path = written(tmp_path / "office.xml", MODEL)
+    path = write_file(tmp_path / "office.xml", MODEL)
     simulation = simulated(path, 2)
     for _ in range(200):
         simulation.advance()
-    assert simulation.truth.contacts == 0  # the loose box lies on the floor, which is no contact
+    assert simulation.truth.contacts == 0  # a box that lies on the floor is no contact
     assert simulation.truth.min_clearance_m > 0.3
     world = load_world(path, 2)
     assert len(world.outlines) == 4
     assert clearance(world.obstacles(), world.start.x, world.start.y) >= 0.6
 
 
-def test_a_model_may_have_more_floors_and_one_that_stands_upright(tmp_path: Path) -> None:
+def test_a_model_may_have_an_upper_floor_and_a_tilted_box_named_floor(tmp_path: Path) -> None:
     upstairs = '<geom type="plane" size="0 0 .1" pos="0 0 3"/>'
     wall = '<geom name="floor2" type="box" size=".1 1 1" pos="9 0 1" euler="0 45 0"/>'
     text = MODEL.replace("<worldbody>", f"<worldbody>{upstairs}{wall}")
-    assert load_world(written(tmp_path / "house.xml", text), 0)
+    assert load_world(write_file(tmp_path / "house.xml", text), 0)
     assert load_world(
-        written(tmp_path / "wall.xml", f"<mujoco><worldbody>{wall}</worldbody></mujoco>"), 0
+        write_file(tmp_path / "wall.xml", f"<mujoco><worldbody>{wall}</worldbody></mujoco>"), 0
     )
 
 
-def test_a_world_file_may_name_what_is_in_the_home(
+def test_a_world_file_may_use_paths_with_a_tilde(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("HOME", str(tmp_path))
     grid(tmp_path)
-    written(tmp_path / "office.xml", MODEL)
+    write_file(tmp_path / "office.xml", MODEL)
     (tmp_path / "worlds").mkdir()
     text = "map: ~/room.yaml\nmodel: ~/office.xml\nstart: [0, 0, 0]\n"
-    world = load_world(written(tmp_path / "worlds" / "both.yaml", text), 0)
+    world = load_world(write_file(tmp_path / "worlds" / "both.yaml", text), 0)
     assert (len(world.shapes), len(world.outlines)) == (5, 4)
 
 
 @pytest.mark.parametrize(
     "real", ["", "<geom name='floor' type='cylinder' size='5 .05' pos='0 0 -.05'/>"]
 )
-def test_a_plane_above_the_floor_is_no_floor(tmp_path: Path, real: str) -> None:
+def test_a_raised_plane_is_not_taken_for_the_floor(tmp_path: Path, real: str) -> None:
     plane = f"<geom type='plane' size='.2 .2 1' pos='0 0 .75' contype='{int(bool(real))}'/>"
     text = f"<mujoco><worldbody>{real}{plane}</worldbody></mujoco>"
-    assert load_world(written(tmp_path / "table.xml", text), 0)
+    assert load_world(write_file(tmp_path / "table.xml", text), 0)
 
 
-def test_the_floor_of_a_model_may_be_below_what_an_arm_stands_on(tmp_path: Path) -> None:
+def test_the_floor_of_a_model_may_be_below_zero(tmp_path: Path) -> None:
     floor = "<geom type='plane' size='1 1 1' pos='0 0 -.75'/>"
-    path = written(tmp_path / "table.xml", f"<mujoco><worldbody>{floor}</worldbody></mujoco>")
+    path = write_file(tmp_path / "table.xml", f"<mujoco><worldbody>{floor}</worldbody></mujoco>")
     assert load_world(path, 0)
 
 
-def test_a_model_and_a_world_file_are_one_world(tmp_path: Path) -> None:
-    written(tmp_path / "office.xml", MODEL)
+def test_a_world_file_may_add_boxes_to_a_model(tmp_path: Path) -> None:
+    write_file(tmp_path / "office.xml", MODEL)
     text = "model: office.xml\nstart: [0, 0, 0]\nboxes:\n  - {at: [1, 0], size: [0.2, 0.2, 0.5]}\n"
-    scan = simulated(written(tmp_path / "both.yaml", text)).scan()
+    scan = simulated(write_file(tmp_path / "both.yaml", text)).scan()
     assert scan[0] == pytest.approx(0.964, abs=0.05)
     assert scan[90] == pytest.approx(1.9, abs=0.05)
 
@@ -378,5 +378,5 @@ def test_a_model_and_a_world_file_are_one_world(tmp_path: Path) -> None:
 )
 def test_a_bad_model_is_refused_in_one_line(text: str, complaint: str, tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=complaint) as raised:
-        load_world(written(tmp_path / "bad.xml", text), 0)
+        load_world(write_file(tmp_path / "bad.xml", text), 0)
     assert "\n" not in str(raised.value)

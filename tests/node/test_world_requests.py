@@ -1,4 +1,4 @@
-"""Obstacles are put into a simulated world over the bus, and the robot's brain stops for them."""
+"""Obstacles are added to a simulated world over the bus, and the robot's brain stops for them."""
 
 import asyncio
 import math
@@ -44,10 +44,10 @@ BRAIN: tuple[Node, ...] = (
 
 
 @asynccontextmanager
-async def robot(
+async def running_robot(
     driver: Driver, folder: Path, brain: tuple[Node, ...] = ()
 ) -> AsyncIterator[tuple[LocalNetwork, Bus]]:
-    """A driver's process and a brain on a network in memory, and a bus to ask them."""
+    """Run a driver's process and a brain in memory; yield the network and an operator's bus."""
     network = LocalNetwork()
 
     def bus(name: str) -> Bus:
@@ -79,23 +79,23 @@ async def ask(bus: Bus, **fields: object) -> SimReply:
     return reply
 
 
-def sent(network: LocalNetwork, key: str) -> list[bytes]:
+def payloads_on(network: LocalNetwork, key: str) -> list[bytes]:
     return [payload for at, payload in network.sent if at == key]
 
 
-async def test_a_robot_stops_for_a_box_that_a_person_puts_into_its_way(tmp_path: Path) -> None:
+async def test_a_robot_stops_for_a_box_added_in_its_way(tmp_path: Path) -> None:
     run = Run(folder=Path(), world="arena", seed=0, speed=20.0, seconds=9.0)
     _, driver = catalog.make_driver("turtlebot3_waffle", run)
-    async with robot(driver, tmp_path, BRAIN) as (network, person):
-        moves = person.latest(STATE)
-        await until(lambda: moves.newest is not None and moves.newest.velocity.linear_x > 0.15)
-        before = await ask(person)
+    async with running_robot(driver, tmp_path, BRAIN) as (network, operator):
+        states = operator.latest(STATE)
+        await until(lambda: states.newest is not None and states.newest.velocity.linear_x > 0.15)
+        before = await ask(operator)
         assert before.ok
         assert before.robot
         pose = before.robot
         x, y = pose.x + 0.75 * math.cos(pose.yaw), pose.y + 0.75 * math.sin(pose.yaw)
         box = Thing(x=x, y=y, yaw=pose.yaw, size=(0.3, 0.8, 0.5))
-        reply = await ask(person, do="add", thing=box, source="ann")
+        reply = await ask(operator, do="add", thing=box, source="ann")
         assert reply.ok, reply.text
         assert [thing.name for thing in reply.things] == ["box1"]
         await until(lambda: driver.finished)
@@ -103,53 +103,55 @@ async def test_a_robot_stops_for_a_box_that_a_person_puts_into_its_way(tmp_path:
         assert 0.0 < float(driver.report()["min_clearance_m"] or 0) < 0.6
     log = [
         msgspec.msgpack.decode(one, type=AcceptedRequest)
-        for one in sent(network, REQUEST_LOG.key)
+        for one in payloads_on(network, REQUEST_LOG.key)
         if b"sim_change" in one
     ]
     assert len(log) == 1
     assert (log[0].process, log[0].service) == ("driver", SIM_CHANGE.key)
     assert '"source":"ann"' in log[0].request
-    scenes = [msgspec.msgpack.decode(one, type=SimScene) for one in sent(network, SIM_SCENE.key)]
+    scenes = [
+        msgspec.msgpack.decode(one, type=SimScene) for one in payloads_on(network, SIM_SCENE.key)
+    ]
     assert [len(scene.things) for scene in scenes] == [0, 1]
-    assert len(sent(network, SIM_POSES.key)) >= 40
-    assert sent(network, WORLD.key)
+    assert len(payloads_on(network, SIM_POSES.key)) >= 40
+    assert payloads_on(network, WORLD.key)
 
 
-async def test_a_refusal_says_why_and_is_not_logged(tmp_path: Path) -> None:
+async def test_a_refused_request_has_a_reason_and_is_not_logged(tmp_path: Path) -> None:
     _, driver = catalog.make_driver("turtlebot3_waffle", Run(folder=Path(), world="arena"))
-    async with robot(driver, tmp_path) as (network, person):
-        assert (await ask(person, do="remove", name="box9")).text.startswith(
+    async with running_robot(driver, tmp_path) as (network, operator):
+        assert (await ask(operator, do="remove", name="box9")).text.startswith(
             "nothing called 'box9'"
         )
-        assert "outside the world" in (await ask(person, do="add", thing=Thing(x=50.0))).text
-        assert not (await ask(person, do="add")).ok
-    assert not sent(network, REQUEST_LOG.key)
+        assert "outside the world" in (await ask(operator, do="add", thing=Thing(x=50.0))).text
+        assert not (await ask(operator, do="add")).ok
+    assert not payloads_on(network, REQUEST_LOG.key)
 
 
 @pytest.mark.parametrize(
     ("link", "why"),
     [("sim", "mock has no simulated world: it is MockBody, no"), ("real", "it is a real body")],
 )
-async def test_a_body_without_a_simulated_world_says_so(
+async def test_requests_are_refused_without_a_simulated_world(
     link: str, why: str, tmp_path: Path
 ) -> None:
     _, driver = catalog.make_driver("mock", Run(folder=Path()))
     driver.run = msgspec.structs.replace(driver.run, link=link)
-    async with robot(driver, tmp_path) as (network, person):
-        reply = await ask(person)
+    async with running_robot(driver, tmp_path) as (network, operator):
+        reply = await ask(operator)
     assert not reply.ok
     assert why in reply.text
-    assert sent(network, BODY.key)
-    assert not sent(network, SIM_SCENE.key)
+    assert payloads_on(network, BODY.key)
+    assert not payloads_on(network, SIM_SCENE.key)
 
 
-async def test_time_that_stands_still_is_reported(
+async def test_a_request_while_time_stands_still_is_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("gigabrain_drivers.sim.live_world.ANSWER_S", 0.05)
     run = Run(folder=Path(), world="arena", speed=2.0)
     _, driver = catalog.make_driver("turtlebot3_waffle", run)
-    async with robot(driver, tmp_path) as (_, person):  # no brain answers, so no tick ends
+    async with running_robot(driver, tmp_path) as (_, operator):  # without a brain no tick ends
         await asyncio.sleep(0.2)
-        reply = await ask(person, do="add", thing=Thing(x=1.0))
+        reply = await ask(operator, do="add", thing=Thing(x=1.0))
     assert "stands still" in reply.text

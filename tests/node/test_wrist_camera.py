@@ -22,8 +22,8 @@ PADS = ("pad_fixed", "pad_moving")
 Pixels = NDArray[np.uint8]
 
 
-class Wrist:
-    """An arm in a world, and the camera at its wrist."""
+class WristCamera:
+    """An arm in a world, with the camera at its wrist."""
 
     def __init__(self, name: str, world: str, prefix: str) -> None:
         robot, driver = make_driver(name, Run(folder=Path(), world=world, cameras=True))
@@ -47,7 +47,7 @@ class Wrist:
         return picture
 
     def geoms_in_sight(self) -> NDArray[np.intp]:
-        """Return the geom of every fourth pixel by rays in the physics, (60, 80); -1: none."""
+        """Return the geom at every fourth pixel, by rays in the physics, (60, 80); -1 for none."""
         camera, link = self.camera, self.data.body(f"robot/{self.camera.link}")
         turn = link.xmat.reshape(3, 3)
         eye = link.xpos + turn @ np.array([camera.x, camera.y, camera.z])
@@ -62,7 +62,7 @@ class Wrist:
         return found
 
     def pads(self) -> list[NDArray[np.bool_]]:
-        """Return where the fixed pad and the moving one are in the picture."""
+        """Return the masks of the fixed and the moving pad in the picture, (60, 80) each."""
         seen = self.geoms_in_sight()
         return [seen == self.model.geom(f"{self._prefix}{name}").id for name in PADS]
 
@@ -71,18 +71,18 @@ class Wrist:
     scope="module", params=[("so101", "table", ""), ("lekiwi", "kitchen", "arm_")],
     ids=["so101", "lekiwi"],
 )  # fmt: skip
-def wrist(request: pytest.FixtureRequest) -> Iterator[Wrist]:
+def wrist(request: pytest.FixtureRequest) -> Iterator[WristCamera]:
     try:
         open_graphics(64, 64).free()
     except ConfigError as error:
         pytest.skip(str(error))
-    made = Wrist(*request.param)
+    made = WristCamera(*request.param)
     with closing(made.renderer):
         yield made
 
 
-def test_both_fingertips_are_in_the_picture_where_rays_of_the_physics_meet_them(
-    wrist: Wrist,
+def test_both_fingertips_are_at_their_true_pixels(
+    wrist: WristCamera,
 ) -> None:
     for posture in POSTURES:
         wrist.move(posture)
@@ -90,25 +90,25 @@ def test_both_fingertips_are_in_the_picture_where_rays_of_the_physics_meet_them(
         for pad in wrist.pads():
             rows, columns = np.nonzero(pad)
             assert len(rows) > 20
-            assert 15 < rows.mean() < 50  # of 60
-            assert 15 < columns.mean() < 65  # of 80
+            assert 15 < rows.mean() < 50  # of 60 rows
+            assert 15 < columns.mean() < 65  # of 80 columns
             shades = picture[pad]
-            assert np.median(shades.max(axis=1)) < 90  # they are dark, the fingers yellow
+            assert np.median(shades.max(axis=1)) < 90  # pads are dark, fingers yellow
             assert np.median(np.ptp(shades, axis=1)) < 20
 
 
-def test_the_camera_moves_with_the_link(wrist: Wrist) -> None:
+def test_the_camera_moves_with_the_link(wrist: WristCamera) -> None:
     pictures, fixed = [], []
     for posture in POSTURES:
         wrist.move(posture)
         pictures.append(wrist.picture().astype(int))
         fixed.append(wrist.pads()[0])
     apart = np.abs(pictures[0] - pictures[1]).max(axis=2)
-    assert (apart[:80] > 20).mean() > 0.6  # what is behind the gripper is something else
-    assert (fixed[0] == fixed[1]).all()  # but the finger stays where it is
+    assert (apart[:80] > 20).mean() > 0.6  # another background
+    assert (fixed[0] == fixed[1]).all()  # the finger stays at its pixels
 
 
-def test_a_gripper_that_opens_moves_one_finger_in_the_picture(wrist: Wrist) -> None:
+def test_opening_the_gripper_moves_one_finger_in_the_picture(wrist: WristCamera) -> None:
     wrist.move(POSTURES[0])
     shut = [np.argwhere(pad)[:, 1].mean() for pad in wrist.pads()]
     wrist.move((*POSTURES[0][:-1], 0.6))
@@ -117,8 +117,8 @@ def test_a_gripper_that_opens_moves_one_finger_in_the_picture(wrist: Wrist) -> N
     assert opened[1] < shut[1] - 4  # to the left of the picture
 
 
-def test_without_a_link_the_same_camera_stays_with_the_body(wrist: Wrist) -> None:
-    fixed = Camera(name="wrist", x=1.0, z=0.5, pitch=0.4, yaw=3.1416)  # looks back at the robot
+def test_a_camera_without_a_link_does_not_move_with_the_arm(wrist: WristCamera) -> None:
+    fixed = Camera(name="wrist", x=1.0, z=0.5, pitch=0.4, yaw=3.1416)  # looks at the robot
     with closing(Renderer({"wrist": View(fixed, 0, errors=False)})) as renderer:
         wrist.renderer, before = renderer, wrist.renderer
         wrist.move(POSTURES[0])
@@ -127,4 +127,4 @@ def test_without_a_link_the_same_camera_stays_with_the_body(wrist: Wrist) -> Non
         other = wrist.picture().astype(int)
         wrist.renderer = before
     moved = np.abs(one - other).max(axis=2) > 20
-    assert 0.001 < moved.mean() < 0.5  # only the arm
+    assert 0.001 < moved.mean() < 0.5  # only the arm moved

@@ -36,8 +36,8 @@ LAB = Zone(name="lab", kind="keepout", points=((1.0, 1.0), (2.0, 1.0), (2.0, 2.0
 KITCHEN = Place(name="kitchen", x=3.0, y=2.5, yaw=0.5)
 
 
-async def patiently(robot: Robot, asking: Awaitable[T]) -> T:
-    task = asyncio.ensure_future(asking)
+async def wait_with_time(robot: Robot, reply: Awaitable[T]) -> T:
+    task = asyncio.ensure_future(reply)
     async with asyncio.timeout(60):
         while not task.done():
             await robot.clock.advance(20_000_000)
@@ -47,24 +47,24 @@ async def patiently(robot: Robot, asking: Awaitable[T]) -> T:
 
 async def ask(robot: Robot, service, request: Message):  # type: ignore[no-untyped-def]
     bus = Bus(robot.network.transport(), robot.clock, "test")
-    replies = await patiently(robot, bus.ask(service, request, timeout_s=600.0))
+    replies = await wait_with_time(robot, bus.ask(service, request, timeout_s=600.0))
     await bus.close()
     return replies[0]
 
 
-def last(robot: Robot, topic: Topic[M]) -> M:
-    """Return the newest message that was published on `topic` at all."""
+def newest_message(robot: Robot, topic: Topic[M]) -> M:
+    """Return the newest of all messages published on `topic`."""
     payload = next(data for key, data in reversed(robot.network.sent) if key == topic.key)
     return Codec(topic.type, topic.max_bytes).decode(payload)
 
 
-async def newest(robot: Robot) -> Zones:
+async def newest_zones(robot: Robot) -> Zones:
     await robot.clock.advance(0)
-    return last(robot, ZONES)
+    return newest_message(robot, ZONES)
 
 
 def house_file() -> ZoneFile:
-    """Return the zones beside the saved map."""
+    """Return the zones saved beside the map `house`."""
     return zone_file.load(map_file.saved_map_path("house"))
 
 
@@ -75,22 +75,22 @@ def _own_state(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 async def test_zones_are_published_saved_with_the_map_and_loaded_with_it() -> None:
     async with Robot() as robot:
-        robot.say()
+        robot.publish_body()
         robot.drive(20)
-        assert (await newest(robot)).zones == ()
+        assert (await newest_zones(robot)).zones == ()
         assert (await ask(robot, ZONES_CHANGE, ZonesRequest(zone=LAB))).ok
         reply = await ask(robot, ZONES_CHANGE, ZonesRequest(place=KITCHEN))
         assert reply == ZonesReply(ok=True, text="added 'kitchen'; save the map to keep it")
-        now = await newest(robot)
+        now = await newest_zones(robot)
         assert ([one.name for one in now.zones], now.map) == (["lab"], "")
         assert (await robot.save("house")).ok
         reply = await ask(robot, ZONES_CHANGE, ZonesRequest(remove="lab"))
         assert reply.text == "removed 'lab'; save the map to keep it"
         assert house_file() == ZoneFile(zones=(LAB,), places=(KITCHEN,))
     async with Robot(PerceptionConfig(mapping="localize", map="house")) as robot:
-        robot.say()
+        robot.publish_body()
         robot.drive(3, still=True)
-        now = await newest(robot)
+        now = await newest_zones(robot)
         assert (now.places, now.map, now.maps_loaded) == ((KITCHEN,), "house", 0)
         reply = await ask(robot, ZONES_CHANGE, ZonesRequest(remove="lab"))
         assert reply.text == "removed 'lab', kept with the map house"
@@ -114,26 +114,24 @@ async def test_zones_are_published_saved_with_the_map_and_loaded_with_it() -> No
         ),
     ],
 )
-async def test_zones_that_make_no_sense_are_refused_and_change_nothing(
-    zone: Zone, why: str
-) -> None:
+async def test_invalid_zones_are_refused_and_change_nothing(zone: Zone, why: str) -> None:
     async with Robot() as robot:
-        robot.say()
+        robot.publish_body()
         robot.drive(20)
         assert (await ask(robot, ZONES_CHANGE, ZonesRequest(zone=LAB, source="ann"))).ok
         assert (await ask(robot, ZONES_CHANGE, ZonesRequest(zone=zone, source="bob"))).text == why
         reply = await ask(robot, ZONES_CHANGE, ZonesRequest(remove="lap"))
         assert reply.text == "no zone or place 'lap'; did you mean 'lab'? known: lab"
-        assert [one.name for one in (await newest(robot)).zones] == ["lab"]
+        assert [one.name for one in (await newest_zones(robot)).zones] == ["lab"]
 
 
-async def test_no_more_zones_than_a_message_holds_are_accepted() -> None:
+async def test_zones_beyond_the_limit_of_a_message_are_refused() -> None:
     ring = tuple(
         (round(9 * math.cos(a), 3), round(9 * math.sin(a), 3))
         for a in np.linspace(0, 2 * math.pi, 256, endpoint=False)
     )
     async with Robot() as robot:
-        robot.say()
+        robot.publish_body()
         robot.drive(20)
         replies = [
             await ask(
@@ -145,12 +143,12 @@ async def test_no_more_zones_than_a_message_holds_are_accepted() -> None:
         ]
         assert [one.ok for one in replies] == [True] * 32 + [False] * 2
         assert "vertices in all zones; expected at most 8192" in replies[-1].text
-        assert len((await newest(robot)).zones) == 32
+        assert len((await newest_zones(robot)).zones) == 32
 
 
-async def test_maps_are_listed_and_loaded_while_it_runs(tmp_path: Path) -> None:
+async def test_maps_are_listed_and_loaded_on_request(tmp_path: Path) -> None:
     async with Robot(PerceptionConfig(mapping="slam", state_dir=str(tmp_path / "robot"))) as robot:
-        robot.say()
+        robot.publish_body()
         robot.drive(40)
         await ask(robot, ZONES_CHANGE, ZonesRequest(place=KITCHEN))
         assert (await robot.save("house")).ok
@@ -169,61 +167,61 @@ async def test_maps_are_listed_and_loaded_while_it_runs(tmp_path: Path) -> None:
         reply = await ask(robot, MAP_LOAD, MapLoadRequest(name="house"))
         assert reply.text == "loaded house; looking for the robot in it"
         robot.drive(1)
-        assert not last(robot, POSE).localized
+        assert not newest_message(robot, POSE).localized
         for _ in range(60):
             robot.drive(1, still=True)
             await robot.clock.advance(100_000_000)
             await asyncio.sleep(0.02)
-            if last(robot, POSE).localized:
+            if newest_message(robot, POSE).localized:
                 break
-        assert last(robot, POSE).localized
-        now = await newest(robot)
+        assert newest_message(robot, POSE).localized
+        now = await newest_zones(robot)
         assert (now.map, now.maps_loaded, now.places) == ("house", 1, (KITCHEN,))
-        await robot.restart()  # with the map that was loaded, not that of its settings
+        await robot.restart()  # loads the map again that was loaded on request
         await robot.ready()
-        robot.say()
+        robot.publish_body()
         robot.drive(3, still=True)
-        now = await newest(robot)
+        now = await newest_zones(robot)
         assert (now.map, now.maps_loaded, now.places) == ("house", 1, (KITCHEN,))
 
 
 async def test_zones_move_with_the_keyframe_beside_them() -> None:
     net = Net()
-    keeper = ZoneServer(net.one, "", lambda: 0)
-    keeper.use_map("", "slam", ZoneFile(zones=(LAB,), places=(KITCHEN,)), loaded=False)
+    server = ZoneServer(net.one, "", lambda: 0)
+    server.use_map("", "slam", ZoneFile(zones=(LAB,), places=(KITCHEN,)), loaded=False)
     poses = np.array(((0.0, 0.0, 0.0), (3.0, 2.0, 0.0)))
-    keeper.follow(0, poses)
-    assert keeper.present.zones == (LAB,)
+    server.follow(0, poses)
+    assert server.present.zones == (LAB,)
     corrected = poses + np.array(((0.0, 0.0, 0.0), (0.5, 0.0, 0.1)))
-    keeper.follow(1, corrected)
-    place = keeper.present.places[0]
+    server.follow(1, corrected)
+    place = server.present.places[0]
     assert place.yaw == pytest.approx(0.6)
     assert (place.x, place.y) == pytest.approx(
         (3.5 - 0.5 * math.sin(0.1), 2.0 + 0.5 * math.cos(0.1))
     )
-    keeper.follow(2, poses)
-    assert keeper.present.places[0].x == pytest.approx(3.0)
-    keeper.follow(3, poses + 0.001)  # too little to be published
-    assert keeper.present.places[0].x == pytest.approx(3.0)
+    server.follow(2, poses)
+    assert server.present.places[0].x == pytest.approx(3.0)
+    server.follow(3, poses + 0.001)  # too little to publish
+    assert server.present.places[0].x == pytest.approx(3.0)
 
 
 @pytest.mark.parametrize("loaded", [False, True])
-async def test_zones_of_a_map_that_grows_on_stay_in_its_file_as_they_fit_its_image(
+async def test_a_zones_file_is_unchanged_while_its_map_is_extended(
     loaded: bool,
 ) -> None:
     saved = ZoneFile(zones=(LAB,))
     zone_file.save(map_file.saved_map_path("house"), saved)
     net = Net()
-    keeper = ZoneServer(net.one, "", lambda: 0)
-    keeper.use_map("house" if loaded else "", "slam", saved, loaded=loaded)
+    server = ZoneServer(net.one, "", lambda: 0)
+    server.use_map("house" if loaded else "", "slam", saved, loaded=loaded)
     if not loaded:
-        keeper.saved_as("house")
+        server.saved_as("house")
     poses = np.array(((0.0, 0.0, 0.0), (1.0, 1.0, 0.0)))
-    keeper.follow(0, poses)
-    keeper.follow(1, poses + np.array((0.6, 0.0, 0.0)))  # a loop was closed
+    server.follow(0, poses)
+    server.follow(1, poses + np.array((0.6, 0.0, 0.0)))  # as after a loop closure
     replies = await net.two.ask(ZONES_CHANGE, ZonesRequest(place=KITCHEN))
     assert [one.text for one in replies] == ["added 'kitchen'; save the map to keep it"]
-    assert keeper.present.zones[0].points[0] == pytest.approx((1.6, 1.0))
+    assert server.present.zones[0].points[0] == pytest.approx((1.6, 1.0))
     assert house_file() == saved
 
 
@@ -240,7 +238,7 @@ async def test_zones_of_a_map_that_grows_on_stay_in_its_file_as_they_fit_its_ima
         ("x" * 300_000, "house.zones.yaml"),
     ],
 )
-def test_a_file_of_zones_that_is_wrong_is_refused_in_one_line(text: str, why: str) -> None:
+def test_an_invalid_zones_file_is_refused_in_one_line(text: str, why: str) -> None:
     path = map_file.saved_map_path("house")
     path.parent.mkdir(parents=True)
     zone_file.path_beside(path).write_text(text)
@@ -249,7 +247,7 @@ def test_a_file_of_zones_that_is_wrong_is_refused_in_one_line(text: str, why: st
     assert "\n" not in str(caught.value)
 
 
-def test_what_is_written_is_read_again() -> None:
+def test_written_zones_are_read_back_unchanged() -> None:
     zones = ZoneFile(
         zones=(
             LAB,
@@ -281,30 +279,30 @@ CORNERS = ((0.0, 0.0), (2.0, 0.0), (2.0, 1.0), (2.0003, 1.0003), (0.0, 1.0))
         ),
     ],
 )
-async def test_a_zone_that_could_not_be_read_again_is_refused(zone: Zone, why: str) -> None:
+async def test_a_zone_invalid_after_rounding_is_refused(zone: Zone, why: str) -> None:
     net = Net()
     ZoneServer(net.one, "", lambda: 0)
     reply = (await net.two.ask(ZONES_CHANGE, ZonesRequest(zone=zone)))[0]
     assert reply.text.startswith(f"zone 'lab': {why}")
 
 
-async def test_a_narrow_zone_that_has_moved_with_the_map_can_be_read_again() -> None:
+async def test_a_narrow_zone_moved_with_the_map_can_be_read_back() -> None:
     slit = ((0, 0), (3, 0), (3, 3), (0, 3), (0, 0.001), (1, 0.001), (1, 2), (2, 2), (2, 0.001))
     lane = Zone(name="lane", kind="one_way", lane_width=1, points=((0, 0), (0.001, 0)))
     net = Net()
-    keeper = ZoneServer(net.one, "", lambda: 0)
+    server = ZoneServer(net.one, "", lambda: 0)
     for zone in (Zone(name="slit", kind="keepout", points=slit), lane):
         assert (await net.two.ask(ZONES_CHANGE, ZonesRequest(zone=zone)))[0].ok
-    keeper.follow(0, np.zeros((1, 3)))
-    keeper.follow(1, np.array(((0.0003, 0.0004, 1.3),)))
+    server.follow(0, np.zeros((1, 3)))
+    server.follow(1, np.array(((0.0003, 0.0004, 1.3),)))
     path = map_file.saved_map_path("house")
-    zone_file.save(path, keeper.present)
+    zone_file.save(path, server.present)
     assert [one.name for one in zone_file.load(path).zones] == ["slit", "lane"]
 
 
-async def test_a_growing_maps_zones_outlive_its_process(tmp_path: Path) -> None:
+async def test_zones_of_an_unsaved_map_outlive_perception(tmp_path: Path) -> None:
     async with Robot(PerceptionConfig(mapping="slam", state_dir=str(tmp_path / "robot"))) as robot:
-        robot.say()
+        robot.publish_body()
         robot.drive(60)
         assert (await ask(robot, ZONES_CHANGE, ZonesRequest(zone=LAB))).ok
         for _ in range(40):
@@ -315,13 +313,13 @@ async def test_a_growing_maps_zones_outlive_its_process(tmp_path: Path) -> None:
                 break
         await robot.restart()
         await robot.ready()
-        robot.say()
+        robot.publish_body()
         robot.drive(3)
-        assert (await newest(robot)).zones == (LAB,)
+        assert (await newest_zones(robot)).zones == (LAB,)
 
 
 @pytest.mark.parametrize(
-    "spoil",
+    "damage",
     [
         lambda path: path.write_bytes(b" " * 5_000_000),
         Path.mkdir,
@@ -329,38 +327,38 @@ async def test_a_growing_maps_zones_outlive_its_process(tmp_path: Path) -> None:
         lambda path: path.write_bytes(b"{"),
     ],
 )
-async def test_a_damaged_state_of_zones_is_left_out_with_one_line(
-    spoil: Callable[[Path], object], tmp_path: Path, caplog: pytest.LogCaptureFixture
+async def test_a_damaged_zones_state_is_skipped_with_one_warning(
+    damage: Callable[[Path], object], tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    spoil(tmp_path / "zones.json")
+    damage(tmp_path / "zones.json")
     assert ZoneServer(Net().one, str(tmp_path), lambda: 0).restore(7) is None
     assert len(caplog.messages) == 1
     assert str(tmp_path / "zones.json") in caplog.messages[0]
 
 
-async def test_zones_that_could_not_be_written_are_once_there_is_room(tmp_path: Path) -> None:
+async def test_zones_are_written_later_if_the_folder_becomes_writable(tmp_path: Path) -> None:
     folder, net = tmp_path / "full", Net()
     folder.write_text("no folder can be made here")
-    keeper = ZoneServer(net.one, str(folder), lambda: 0)
-    keeper.set_boot(7)
+    server = ZoneServer(net.one, str(folder), lambda: 0)
+    server.set_boot(7)
     await net.two.ask(ZONES_CHANGE, ZonesRequest(zone=LAB))
-    await keeper.finish_writing()
-    assert keeper.problems()
+    await server.finish_writing()
+    assert server.problems()
     folder.unlink()
-    keeper.publish(500)
-    await keeper.finish_writing()
-    assert not keeper.problems()
+    server.publish(500)
+    await server.finish_writing()
+    assert not server.problems()
     kept = ZoneServer(Net().one, str(folder), lambda: 0).restore(7)
     assert kept
     assert [one.zone for one in kept.items] == [LAB]
 
 
 @pytest.mark.parametrize("mapping", ["localize", "slam"])
-async def test_a_map_that_was_loaded_and_is_gone_does_not_end_perception(
+async def test_a_loaded_map_that_is_deleted_does_not_end_perception(
     mapping: Literal["localize", "slam"], tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     async with Robot(PerceptionConfig(mapping="slam", state_dir=str(tmp_path / "robot"))) as robot:
-        robot.say()
+        robot.publish_body()
         robot.drive(40)
         await ask(robot, ZONES_CHANGE, ZonesRequest(place=KITCHEN))
         assert (await robot.save("house")).ok
@@ -369,19 +367,21 @@ async def test_a_map_that_was_loaded_and_is_gone_does_not_end_perception(
         for _ in range(2):
             await robot.restart()
             await robot.ready()
-            robot.say()
+            robot.publish_body()
             robot.drive(3)
-            now = await newest(robot)
+            now = await newest_zones(robot)
             assert (now.map, now.places) == ("", ())
-            assert last(robot, POSE).localized
-    told = [line for line in caplog.messages if line.startswith("map 'house' is not loaded again")]
-    assert len(told) == 1
-    assert "house.yaml: no such file" in told[0]
+            assert newest_message(robot, POSE).localized
+    warnings = [
+        line for line in caplog.messages if line.startswith("map 'house' is not loaded again")
+    ]
+    assert len(warnings) == 1
+    assert "house.yaml: no such file" in warnings[0]
 
 
-async def test_a_map_that_grows_on_outlives_the_file_that_it_began_with(tmp_path: Path) -> None:
+async def test_an_extended_map_outlives_its_deleted_file(tmp_path: Path) -> None:
     async with Robot(PerceptionConfig(mapping="slam", state_dir=str(tmp_path / "robot"))) as robot:
-        robot.say()
+        robot.publish_body()
         robot.drive(40)
         await ask(robot, ZONES_CHANGE, ZonesRequest(place=KITCHEN))
         assert (await robot.save("house")).ok
@@ -393,7 +393,7 @@ async def test_a_map_that_grows_on_outlives_the_file_that_it_began_with(tmp_path
         map_file.saved_map_path("house").unlink()
         await robot.restart()
         await robot.ready()
-        robot.say()
+        robot.publish_body()
         robot.drive(3, still=True)
-        now = await newest(robot)
+        now = await newest_zones(robot)
         assert (now.map, now.maps_loaded, now.places) == ("house", 1, (KITCHEN,))

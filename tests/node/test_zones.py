@@ -1,4 +1,4 @@
-"""Zones and places: decision drives a body in a flat world by them, in fake time."""
+"""Zones and places: decision respects them in a flat world, in fake time."""
 
 import functools
 import math
@@ -29,7 +29,7 @@ def box(name: str, x: float, y: float, to_x: float, to_y: float, **more: float) 
     return Zone(name=name, kind=kind, points=((x, y), (to_x, y), (to_x, to_y), (x, to_y)), **more)
 
 
-def send(plane: Plane, *zones: Zone, places: tuple[Place, ...] = (), loaded: int = 0) -> None:
+def send_zones(plane: Plane, *zones: Zone, places: tuple[Place, ...] = (), loaded: int = 0) -> None:
     message = Zones(
         zones=zones, places=places, boot=plane.boot, tick=plane.tick, maps_loaded=loaded
     )
@@ -40,37 +40,37 @@ def corners(plane: Plane) -> np.ndarray:
     return transform(np.array((plane.x, plane.y, plane.yaw)), np.array(WAFFLE.footprint))
 
 
-async def drive(plane: Plane, zone: Zone, seconds: float) -> tuple[float, float]:
-    """Return the least distance of the body to a zone [m], and its greatest speed in it [m/s]."""
-    shape, least, fastest = np.array(zone.points), math.inf, 0.0
+async def measure_drive(plane: Plane, zone: Zone, seconds: float) -> tuple[float, float]:
+    """Return the body's minimum distance to a zone [m], and its maximum speed in it [m/s]."""
+    shape, min_distance, max_speed = np.array(zone.points), math.inf, 0.0
     for _ in range(round(seconds * 10)):
         await plane.go(0.1)
-        here = float(polygon.distance(shape, corners(plane)).min())
-        least = min(least, here)
-        fastest = max(fastest, plane.velocity.linear_x) if here == 0.0 else fastest
+        distance = float(polygon.distance(shape, corners(plane)).min())
+        min_distance = min(min_distance, distance)
+        max_speed = max(max_speed, plane.velocity.linear_x) if distance == 0.0 else max_speed
         if not plane.status.current and plane.status.done:
             break
-    return least, fastest
+    return min_distance, max_speed
 
 
 @pytest.mark.parametrize("order", [1, -1])
-async def test_it_drives_round_a_keep_out_zone_and_enters_it_nowhere(order: int) -> None:
+async def test_it_drives_round_a_keep_out_zone(order: int) -> None:
     lab = box("lab", 3.0, 1.5, 5.0, 6.0)
     lab = Zone(name="lab", kind="keepout", points=lab.points[::order])
     async with Plane(HALL, at=(1.0, 3.5, 0.0)) as plane:
         await plane.go(0.2)
-        send(plane, lab)
+        send_zones(plane, lab)
         await plane.go(0.2)
         reply = await plane.ask(GOAL, GoalRequest(x=7.0, y=3.5))
         assert reply.ok, reply.text
-        least, _ = await drive(plane, lab, 90)
+        least, _ = await measure_drive(plane, lab, 90)
         assert plane.status.done[0].state == "succeeded"
         assert least > 0.0
 
 
-async def test_a_goal_in_a_keep_out_zone_is_refused_by_its_name() -> None:
+async def test_a_goal_in_a_keep_out_zone_is_refused_with_its_name() -> None:
     async with Plane(HALL, at=(1.0, 3.0, 0.0)) as plane:
-        send(plane, box("lab", 4.0, 2.0, 6.0, 4.0))
+        send_zones(plane, box("lab", 4.0, 2.0, 6.0, 4.0))
         await plane.go(0.4)
         reply = await plane.ask(GOAL, GoalRequest(x=5.0, y=3.0))
         assert not reply.ok
@@ -82,7 +82,7 @@ async def test_a_goal_in_a_keep_out_zone_is_refused_by_its_name() -> None:
 
 async def test_a_goal_behind_zones_is_refused_with_the_zone_in_the_way() -> None:
     async with Plane(HALL, at=(1.0, 3.0, 0.0)) as plane:
-        send(plane, box("wall", 4.0, -1.0, 4.5, 9.0))
+        send_zones(plane, box("wall", 4.0, -1.0, 4.5, 9.0))
         await plane.go(0.4)
         reply = await plane.ask(GOAL, GoalRequest(x=7.0, y=3.0))
         assert not reply.ok
@@ -91,25 +91,25 @@ async def test_a_goal_behind_zones_is_refused_with_the_zone_in_the_way() -> None
         )
 
 
-async def test_a_zone_over_its_goal_ends_the_task_with_the_reason() -> None:
+async def test_a_new_zone_over_the_goal_fails_the_task_with_the_reason() -> None:
     async with Plane(HALL, at=(1.0, 3.0, 0.0)) as plane:
         await plane.go(0.2)
         assert (await plane.ask(GOAL, GoalRequest(x=7.0, y=3.0))).ok
         await plane.go(3.0)
-        send(plane, box("lab", 6.0, 2.0, 7.9, 4.0))
+        send_zones(plane, box("lab", 6.0, 2.0, 7.9, 4.0))
         await plane.until("failed", seconds=2)
         assert plane.status.done[0].reason.startswith("the goal lies in keep-out zone 'lab'")
         assert plane.x < 6.0
 
 
-async def test_a_zone_ahead_is_avoided_although_the_old_path_leads_through_it() -> None:
+async def test_a_new_zone_on_the_path_is_avoided() -> None:
     async with Plane(HALL, at=(1.0, 3.0, 0.0)) as plane:
         await plane.go(0.2)
         await plane.ask(GOAL, GoalRequest(x=7.0, y=3.0))
         await plane.go(5.0)
         ahead = box("spill", plane.x + 0.5, 2.5, plane.x + 1.5, 3.5)
-        send(plane, ahead)
-        least, _ = await drive(plane, ahead, 60)
+        send_zones(plane, ahead)
+        least, _ = await measure_drive(plane, ahead, 60)
         assert plane.status.done[0].state == "succeeded"
         assert least > 0.0
 
@@ -118,9 +118,9 @@ async def test_a_zone_ahead_is_avoided_although_the_old_path_leads_through_it() 
 async def test_a_robot_inside_a_zone_leaves_it_by_the_shortest_way() -> None:
     lab = box("lab", 1.0, 1.0, 6.0, 5.0)
     async with Plane(HALL, at=(2.0, 3.0, 0.0)) as plane:
-        send(plane, lab)
+        send_zones(plane, lab)
         await plane.go(0.4)
-        assert plane.travelled == 0.0  # it does not drive by itself
+        assert plane.travelled == 0.0  # it stands without a goal
         reply = await plane.ask(GOAL, GoalRequest(x=7.0, y=3.0))
         assert reply.ok, reply.text
         most_x, inside = 0.0, True
@@ -128,9 +128,9 @@ async def test_a_robot_inside_a_zone_leaves_it_by_the_shortest_way() -> None:
             await plane.go(0.1)
             inside = bool(polygon.distance(np.array(lab.points), corners(plane)).min() == 0.0)
             most_x = max(most_x, plane.x)
-        assert plane.x < 1.0  # and not through the zone to the goal
+        assert plane.x < 1.0  # not through the zone
         assert most_x < 2.3
-        least, _ = await drive(plane, lab, 90)
+        least, _ = await measure_drive(plane, lab, 90)
         assert plane.status.done[0].state == "succeeded"
         assert least > 0.0
 
@@ -140,7 +140,7 @@ async def test_a_robot_leaving_a_zone_sees_the_obstacles_in_it() -> None:
     cells = HALL.copy()
     cells[40:80, 30:32] = 100  # a wall between the robot and the nearest edge
     async with Plane(cells, at=(2.0, 3.0, 0.0)) as plane:
-        send(plane, box("lab", 1.0, 0.1, 6.0, 5.9))
+        send_zones(plane, box("lab", 1.0, 0.1, 6.0, 5.9))
         await plane.go(0.4)
         assert (await plane.ask(GOAL, GoalRequest(x=7.0, y=3.0))).ok
         await plane.until("succeeded", seconds=120)
@@ -149,23 +149,23 @@ async def test_a_robot_leaving_a_zone_sees_the_obstacles_in_it() -> None:
 
 async def test_zones_over_the_whole_map_leave_no_goal() -> None:
     async with Plane(HALL, at=(2.0, 3.0, 0.0)) as plane:
-        send(plane, box("all", -100.0, -1e5, 1e5, 1e5))
+        send_zones(plane, box("all", -100.0, -1e5, 1e5, 1e5))
         await plane.go(0.4)
         reply = await plane.ask(GOAL, GoalRequest(x=7.0, y=3.0))
         assert reply.text.startswith("the goal lies in keep-out zone 'all'")
-        send(plane)
+        send_zones(plane)
         await plane.go(0.4)
         assert (await plane.ask(GOAL, GoalRequest(x=7.0, y=3.0))).ok
 
 
 @pytest.mark.slow
-async def test_the_body_is_slow_in_a_speed_zone_and_before_it() -> None:
+async def test_the_body_obeys_the_limit_of_a_speed_zone() -> None:
     ramp = box("ramp", 3.0, 0.0, 5.0, 6.0, max_speed=0.1)
     async with Plane(HALL, at=(1.0, 3.0, 0.0)) as plane:
-        send(plane, ramp)
+        send_zones(plane, ramp)
         await plane.go(0.4)
         await plane.ask(GOAL, GoalRequest(x=7.0, y=3.0))
-        _, fastest = await drive(plane, ramp, 120)
+        _, fastest = await measure_drive(plane, ramp, 120)
         assert plane.status.done[0].state == "succeeded"
         assert 0.08 < fastest < 0.106
         reasons = {one.reason for one in plane.intents}
@@ -173,13 +173,13 @@ async def test_the_body_is_slow_in_a_speed_zone_and_before_it() -> None:
 
 
 @pytest.mark.slow
-async def test_a_one_way_lane_is_driven_along_and_gone_round_against() -> None:
+async def test_a_one_way_lane_is_used_forwards_and_bypassed_backwards() -> None:
     lane = Zone(name="lane", kind="one_way", points=((2.0, 3.0), (6.0, 3.0)), lane_width=2.0)
 
-    async def passes(start: float, goal: float) -> float:
-        """Return how far the body went off the middle of the lane, at its half."""
+    async def offset_from_lane(start: float, goal: float) -> float:
+        """Drive and return the distance to the middle of the lane at half its length [m]."""
         async with Plane(HALL, at=(start, 3.0, 0.0)) as plane:
-            send(plane, lane)
+            send_zones(plane, lane)
             await plane.go(0.4)
             assert (await plane.ask(GOAL, GoalRequest(x=goal, y=3.0))).ok
             before, off = plane.x, math.nan
@@ -190,14 +190,14 @@ async def test_a_one_way_lane_is_driven_along_and_gone_round_against() -> None:
             assert plane.status.done[0].state == "succeeded"
             return off
 
-    assert await passes(1.0, 7.0) < 0.3
-    assert await passes(7.0, 1.0) > 0.85  # a corner of it may be cut
+    assert await offset_from_lane(1.0, 7.0) < 0.3
+    assert await offset_from_lane(7.0, 1.0) > 0.85  # it may cut a corner
 
 
-async def test_a_goal_against_the_only_lane_is_refused_by_its_name() -> None:
+async def test_a_goal_against_the_only_lane_is_refused_with_its_name() -> None:
     lane = Zone(name="door", kind="one_way", points=((3.0, 3.0), (5.0, 3.0)), lane_width=6.0)
     async with Plane(HALL, at=(7.0, 3.0, 0.0)) as plane:
-        send(plane, lane)
+        send_zones(plane, lane)
         await plane.go(0.4)
         reply = await plane.ask(GOAL, GoalRequest(x=1.0, y=3.0))
         assert not reply.ok
@@ -211,7 +211,7 @@ async def test_named_places_are_goals_and_parts_of_missions() -> None:
         await plane.go(0.2)
         reply = await plane.ask(GOAL, GoalRequest(place="kitchen"))
         assert (reply.ok, reply.text) == (False, "no place 'kitchen'; known: none")
-        send(plane, places=(kitchen, Place(name="dock", x=1.0, y=1.0)))
+        send_zones(plane, places=(kitchen, Place(name="dock", x=1.0, y=1.0)))
         await plane.go(0.2)
         reply = await plane.ask(GOAL, GoalRequest(place="kichen"))
         assert reply.text == "no place 'kichen'; did you mean 'kitchen'? known: dock, kitchen"
@@ -221,7 +221,7 @@ async def test_named_places_are_goals_and_parts_of_missions() -> None:
         assert abs(plane.yaw - 1.5) < 0.15
         assert plane.status.done[0].label == "kitchen (3.00, 2.00, 1.50 rad)"
         assert (await plane.ask(MISSION, MissionRequest(mission=mission))).ok
-        send(plane)  # the mission has taken the place with it
+        send_zones(plane)  # the mission keeps its copy of the place
         await plane.until("succeeded", seconds=90)
         assert math.hypot(plane.x - 1.0, plane.y - 3.0) < 0.15
         reply = await plane.ask(MISSION, MissionRequest(mission=mission, label="round"))
@@ -230,25 +230,25 @@ async def test_named_places_are_goals_and_parts_of_missions() -> None:
 
 async def test_another_map_cancels_all_tasks() -> None:
     async with Plane(HALL, at=(1.0, 3.0, 0.0)) as plane:
-        send(plane, loaded=1)
+        send_zones(plane, loaded=1)
         await plane.go(0.2)
         await plane.ask(GOAL, GoalRequest(x=7.0, y=3.0))
         await plane.go(1.0)
-        send(plane, loaded=2)
+        send_zones(plane, loaded=2)
         await plane.until("cancelled", seconds=2)
 
 
-async def test_a_replay_with_zones_that_change_meanwhile_decides_the_same() -> None:
+async def test_a_replay_with_changed_zones_gives_the_same_intents() -> None:
     async with Plane(HALL, at=(1.0, 3.0, 0.0)) as plane:
         events = record(plane.bench.network, plane.bench.clock)
         await plane.go(0.4)
-        send(plane, places=(Place(name="far", x=7.0, y=3.0),))
+        send_zones(plane, places=(Place(name="far", x=7.0, y=3.0),))
         await plane.go(0.2)
         assert (await plane.ask(GOAL, GoalRequest(place="far", source="ann"))).ok
         await plane.go(3.0)
         before = plane.status.path
         slow = box("slow", 1.5, 0.0, 2.5, 6.0, max_speed=0.1)
-        send(plane, box("spill", 3.0, 2.0, 4.0, 4.0), slow)
+        send_zones(plane, box("spill", 3.0, 2.0, 4.0, 4.0), slow)
         await plane.go(4.0)
         assert plane.status.path != before
         assert "speed zone 'slow'" in plane.intent.reason

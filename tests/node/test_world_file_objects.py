@@ -1,4 +1,4 @@
-"""Things and tags of a world file, seen by a rendered camera: where they are, and how large."""
+"""Things and tags of a world file in a rendered camera: they have their places and sizes."""
 
 import math
 from contextlib import closing
@@ -35,7 +35,7 @@ SIZES = {130: 0.2, 586: 0.1}
 
 
 def exposure(world: str) -> tuple[np.ndarray, np.ndarray]:
-    """Return the picture and depth of the camera of a Waffle at a world's start."""
+    """Return picture and depth of a Waffle's camera at the start of a world."""
     try:
         open_graphics(64, 64).free()
     except ConfigError as error:
@@ -51,14 +51,14 @@ def exposure(world: str) -> tuple[np.ndarray, np.ndarray]:
     return frame.picture, frame.depth
 
 
-def written(tmp_path: Path, text: str) -> str:
+def world_file(tmp_path: Path, text: str) -> str:
     path = tmp_path / "room.yaml"
     path.write_text(text)
     return str(path)
 
 
-def test_tags_of_a_world_file_are_seen_where_they_hang_and_by_pupil_apriltags_too(tmp_path):
-    picture, depth = exposure(written(tmp_path, WORLD))
+def test_tags_are_found_at_their_places_by_our_finder_and_by_pupil_apriltags(tmp_path):
+    picture, depth = exposure(world_file(tmp_path, WORLD))
     grey = cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY)
     found = {tag.id: tag for tag in TagFinder(sizes=SIZES).find(grey, MODEL, depth)}
     for tag, place, yaw in (
@@ -76,7 +76,7 @@ def test_tags_of_a_world_file_are_seen_where_they_hang_and_by_pupil_apriltags_to
         assert np.abs(corners - np.array(found[tag].corners)).max() < 0.6
 
 
-def test_things_of_a_world_file_are_placed_by_their_boxes(tmp_path):
+def test_things_are_placed_and_measured_by_box_and_depth(tmp_path):
     text = "size: [6, 6]\nstart: [0, 0, 0]\n"
     for line, label, place, size in (
         ("balls: [{at: [1.2, 0.1]}]", "ball", (1.2, 0.1, 0.1), (0.2, 0.2)),
@@ -84,8 +84,8 @@ def test_things_of_a_world_file_are_placed_by_their_boxes(tmp_path):
         ("boxes: [{at: [1.3, 0], size: [0.16, 0.16, 0.16], yaw: 0.4}]", "cube",
          (1.3, 0.0, 0.08), (0.21, 0.16)),
     ):  # fmt: skip
-        empty, _ = exposure(written(tmp_path, text))
-        picture, depth = exposure(written(tmp_path, text + line + "\n"))
+        empty, _ = exposure(world_file(tmp_path, text))
+        picture, depth = exposure(world_file(tmp_path, text + line + "\n"))
         rows, columns = np.nonzero(np.abs(picture.astype(int) - empty).max(axis=2) > 45)
         box = columns.min(), rows.min(), columns.max() + 1, rows.max() + 1
         placed = thing_place(label, tuple(map(float, box)), MODEL, depth)
@@ -95,7 +95,7 @@ def test_things_of_a_world_file_are_placed_by_their_boxes(tmp_path):
         assert placed.size == pytest.approx(size, abs=0.05)
 
 
-def test_the_playroom_has_room_for_a_robot():
+def test_the_start_of_the_playroom_is_clear():
     world = load_world("playroom", 0)
     assert min(one.distance(world.start.x, world.start.y) for one in world.shapes) > 0.3
     assert len(world.shapes) < 60
@@ -112,12 +112,12 @@ def test_the_playroom_has_room_for_a_robot():
         ("cans: [{at: [1, 1], height: -1}]", "room.yaml:2: "),
     ],
 )
-def test_what_is_wrong_with_a_thing_is_named_with_its_line(tmp_path, line, expected):
+def test_an_invalid_thing_or_tag_is_refused_with_its_line(tmp_path, line, expected):
     with pytest.raises(ConfigError, match=expected):
-        load_world(written(tmp_path, f"size: [4, 4]\n{line}\n"), 0)
+        load_world(world_file(tmp_path, f"size: [4, 4]\n{line}\n"), 0)
 
 
-def test_the_rectangles_of_a_tag_cover_its_white_cells_once():
+def test_rectangles_of_a_tag_cover_each_white_cell_once():
     white = cells(7)
     times = np.zeros(white.shape, int)
     for left, top, right, bottom in rectangles(white):

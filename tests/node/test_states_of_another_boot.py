@@ -1,4 +1,4 @@
-"""A stranger who publishes and keeps states of another robot on a driving robot's key."""
+"""A stranger publishes and serves states of another robot on a driving robot's key."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -14,20 +14,20 @@ from gigabrain_zenoh import codec
 from gigabrain_zenoh.testing.in_memory import BRAIN, RobotInMemory
 
 OTHER_BOOT = 4711
-FULL_SPEED = 0.26  # [m/s]
-BURST = 2  # states between two of the robot's own; three that agree would be believed
+FULL_SPEED_M_S = 0.26
+BURST_STATES = 2  # states between two of the robot; three in agreement would be accepted
 
 
 class Stranger:
-    """Publishes states of another start and place, and answers for the kept one."""
+    """Publishes states with another boot and pose, and answers queries for the kept state."""
 
     def __init__(self, robot: RobotInMemory) -> None:
         assert robot.state
-        self._robot, self._state, self.asked = robot, robot.state, 0
+        self._robot, self._state, self.queries = robot, robot.state, 0
         self._state = self._next()
 
     def publish(self) -> None:
-        for _ in range(BURST):
+        for _ in range(BURST_STATES):
             self._state = self._next()
             self._robot.network.deliver(STATE.key, codec.encode(self._state))
 
@@ -39,22 +39,22 @@ class Stranger:
         )
 
     async def answer(self, _: bytes) -> tuple[bytes, str]:
-        self.asked += 1
+        self.queries += 1
         return codec.encode(self._state), ""
 
 
 @contextmanager
 def stranger(robot: RobotInMemory) -> Iterator[Stranger]:
-    made = Stranger(robot)
-    ends = robot.network.serve(STATE.key, made.answer)
-    yield made
-    ends()
+    stranger_states = Stranger(robot)
+    end_serving = robot.network.serve(STATE.key, stranger_states.answer)
+    yield stranger_states
+    end_serving()
 
 
 async def driving(robot: RobotInMemory) -> None:
     await robot.go(100)
     assert robot.mode == "enabled"
-    assert robot.body.speeds[-1] == pytest.approx(FULL_SPEED)
+    assert robot.body.speeds[-1] == pytest.approx(FULL_SPEED_M_S)
 
 
 async def test_a_driving_robot_is_not_confused_by_states_of_another_boot(tmp_path: Path) -> None:
@@ -64,7 +64,7 @@ async def test_a_driving_robot_is_not_confused_by_states_of_another_boot(tmp_pat
             for _ in range(100):
                 other.publish()
                 (speed,) = await robot.go(1)
-                assert speed == pytest.approx(FULL_SPEED)
+                assert speed == pytest.approx(FULL_SPEED_M_S)
                 assert robot.mode == "enabled"
         own = robot.bus("driver").time
         for name in BRAIN:
@@ -77,7 +77,7 @@ async def test_a_driving_robot_is_not_confused_by_states_of_another_boot(tmp_pat
 
 
 @pytest.mark.parametrize("name", ["perception", "control"])
-async def test_a_process_that_starts_beside_a_stranger_finds_its_robot(
+async def test_a_process_that_starts_beside_a_stranger_follows_its_own_robot(
     name: str, tmp_path: Path
 ) -> None:
     async with RobotInMemory(tmp_path) as robot:
@@ -87,10 +87,10 @@ async def test_a_process_that_starts_beside_a_stranger_finds_its_robot(
             await robot.go(50)
             assert robot.body.speeds[-1] == 0.0
             robot.start(name)
-            for _ in range(30):  # five states of the robot for two of the stranger's
+            for _ in range(30):  # two states of the stranger per five of the robot
                 other.publish()
                 await robot.go(5)
             if name == "control":  # perception without a map needs no state
-                assert other.asked > 0
-            assert robot.body.speeds[-1] == pytest.approx(FULL_SPEED)
+                assert other.queries > 0
+            assert robot.body.speeds[-1] == pytest.approx(FULL_SPEED_M_S)
             assert robot.bus(name).time.boot == robot.bus("driver").time.boot

@@ -1,4 +1,4 @@
-"""A goal while an operator holds the body: its timer stops, and its reason says why."""
+"""A goal while an operator or the gate holds the body: its timers stop, and it has a reason."""
 
 import math
 from collections.abc import Callable
@@ -56,7 +56,7 @@ def script(plane: Held) -> None:
         (script, "script-7 has the body"),
     ],
 )
-async def test_a_goal_waits_while_the_body_is_held_and_gives_the_reason(
+async def test_a_goal_waits_with_a_reason_while_the_body_is_held(
     hold: Callable[[Held], None], why: str
 ) -> None:
     async with Held(CELLS) as plane:
@@ -78,7 +78,7 @@ async def test_a_goal_waits_while_the_body_is_held_and_gives_the_reason(
         assert done.heading_error is None
 
 
-async def test_a_time_limit_of_a_mission_does_not_count_while_an_operator_holds() -> None:
+async def test_the_time_limit_of_a_mission_stops_while_an_operator_drives() -> None:
     text = "do: [{timeout: {seconds: 3, do: [{goto: [4, 0.8]}]}}]"
     async with Held(CELLS) as plane:
         await plane.go(0.2)

@@ -1,4 +1,4 @@
-"""In lock-step a drive is the same whichever message of a tick is quicker."""
+"""In lock-step a drive is the same for any order of arrival of the messages of a tick."""
 
 import asyncio
 import functools
@@ -28,22 +28,23 @@ from gigabrain_zenoh.runtime.replay import Node
 from gigabrain_zenoh.testing.in_memory import BRAIN
 from gigabrain_zenoh.testing.samples import round_room
 
-BOLD = PerceptionConfig(ahead=0.3, corridor=0.05, turning_room=0.0)  # as close as safety allows
+# drives as close to obstacles as safety allows
+CLOSE_DRIVING = PerceptionConfig(ahead=0.3, corridor=0.05, turning_room=0.0)
 Pending = tuple[str, bytes, OnSample]
 
 
 class ShuffledEnd(LocalTransport):
-    """One process's end of a ShuffledNetwork: what comes is kept until its turn comes."""
+    """A transport that keeps messages until the test delivers them."""
 
     def __init__(self, network: LocalNetwork) -> None:
         super().__init__(network)
         self.pending: list[Pending] = []  # in order of sending
 
     def subscribe(self, key: str, on_sample: OnSample, depth: int) -> Close:
-        def keep(key: str, payload: bytes) -> None:
+        def queue_message(key: str, payload: bytes) -> None:
             self.pending.append((key, payload, on_sample))
 
-        return super().subscribe(key, keep, depth)
+        return super().subscribe(key, queue_message, depth)
 
     @property
     def states_pending(self) -> int:
@@ -51,7 +52,7 @@ class ShuffledEnd(LocalTransport):
         return sum(key == STATE.key for key, _, _ in self.pending)
 
     def deliver_one(self, draw: random.Random) -> None:
-        """Any of the oldest per key; but a new tick is heard of after all that went before it."""
+        """Deliver a random one of the oldest messages per key; states wait for all before them."""
         heads: dict[str, Pending] = {}
         for place, entry in enumerate(self.pending):
             if entry[0] != STATE.key or place == 0:
@@ -61,31 +62,34 @@ class ShuffledEnd(LocalTransport):
         on_sample(key, payload)
 
 
-class Roamer(MockBody):
-    """The mock, in a room that stays where it is."""
+class BodyInFixedRoom(MockBody):
+    """The mock body, in a room that does not move with it."""
 
     def _scan(self) -> LaserScan | None:
-        scan, here = super()._scan(), self._pose
+        scan, pose = super()._scan(), self._pose
         assert scan
-        ranges = round_room(1.2, here.x, here.y, here.yaw) + self._noise.normal(0.0, 0.01, 360)
+        ranges = round_room(1.2, pose.x, pose.y, pose.yaw) + self._noise.normal(0.0, 0.01, 360)
         return replace(scan, ranges=ranges_bytes(ranges))
 
 
-Story = list[tuple[int, str, Velocity, Pose]]
+Drive = list[tuple[int, str, Velocity, Pose]]
 
 
-async def drive(folder: Path, seed: int, ticks: int) -> Story:
-    """Mode, speed and place at each tick of a drive whose messages are shuffled by `seed`."""
+async def drive(folder: Path, seed: int, ticks: int) -> Drive:
+    """Drive with messages shuffled by `seed`; return mode, velocity and pose at each tick."""
     draw, network, clock = random.Random(seed), LocalNetwork(), FakeClock()
     robot = load_robot("mock")
-    body = Roamer(robot, MockOptions(driver="mock"), Run(folder=folder, speed=100.0))
+    body = BodyInFixedRoom(robot, MockOptions(driver="mock"), Run(folder=folder, speed=100.0))
     config = DriverConfig(
         body="mock", speed=100.0, lockstep_timeout_s=60.0, resume="auto", state_dir=str(folder)
     )
     ends = [ShuffledEnd(network) for _ in range(5)]
     driver_bus, *brain_buses = [Bus(end, clock) for end in ends]
     driver = DriverProcess(config, robot, body, driver_bus)
-    brain: dict[str, Node] = {**BRAIN, "perception": functools.partial(perception.run, BOLD)}
+    brain: dict[str, Node] = {
+        **BRAIN,
+        "perception": functools.partial(perception.run, CLOSE_DRIVING),
+    }
     running = [
         asyncio.ensure_future(node(bus, lambda: None))
         for bus, node in zip(brain_buses, brain.values(), strict=True)
@@ -106,20 +110,20 @@ async def drive(folder: Path, seed: int, ticks: int) -> Story:
     for bus in (driver_bus, *brain_buses):
         await bus.close()
     assert driver.report()["lockstep_timeouts"] == 0
-    return story(network)[:ticks]
+    return recorded_drive(network)[:ticks]
 
 
-def story(network: LocalNetwork) -> Story:
+def recorded_drive(network: LocalNetwork) -> Drive:
     """Return tick, mode, velocity and pose of each state, once for each tick.
 
-    The first tick is published again and again until the brain is there.
+    The first tick is published repeatedly until the brain answers.
     """
     decode = msgspec.msgpack.Decoder(RobotState).decode
     states = {(s := decode(data)).tick: s for key, data in network.sent if key == STATE.key}
     return [(s.tick, s.gate.mode, s.velocity, s.pose) for s in states.values()]
 
 
-async def test_a_drive_is_the_same_whichever_message_is_quicker(
+async def test_a_drive_does_not_depend_on_the_order_of_messages(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     caplog.set_level(logging.INFO, "gigabrain_zenoh.safety")
