@@ -1,7 +1,7 @@
-"""Solves inverse kinematics by mink, for `test_arm_judges.py`: `python arm_judges.py MODEL GOALS`.
+"""Solve inverse kinematics by mink, for `test_arm_judges.py`: `python arm_judges.py MODEL GOALS`.
 
-GOALS is JSON: for each goal a start (5,), a place (3,) and a quaternion (4,). Prints, as JSON, for
-each whether mink comes within 0.1 mm and 0.01 rad of it.
+GOALS is JSON: for each goal a start posture (5,), a position (3,) and a quaternion (4,). Prints a
+JSON list: for each goal, true if mink comes within 0.1 mm and 0.01 rad of it.
 """
 
 import json

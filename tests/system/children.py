@@ -1,4 +1,4 @@
-"""Small processes for a supervisor, and what becomes of them."""
+"""Small processes for tests of the supervisor, and helpers to observe them."""
 
 import asyncio
 import json
@@ -39,7 +39,7 @@ def spec(name: str, code: str = SERVE, *after: str, **more: Any) -> ProcessSpec:
 
 
 def forked(name: str, code: str = SERVE, *after: str, **more: Any) -> ProcessSpec:
-    """The same, which a fork server may start; needs ROOT in PYTHONPATH."""
+    """Return such a process that a fork server may start. Needs ROOT in PYTHONPATH."""
     imports = more.pop("imports", ((__name__,),))
     request = ForkRequest("tests.system.children:run", CHILD + code, f"forked {name}", imports)
     return spec(name, code, *after, fork=request, **more)
@@ -76,19 +76,19 @@ async def running(
         await supervisor.stop(within_s=1.0)
         await task
     for pid in pids:
-        with pytest.raises(ProcessLookupError):  # not even a zombie is left
+        with pytest.raises(ProcessLookupError):  # not even a zombie
             os.kill(pid, 0)
 
 
 def state(pid: int) -> str:
-    """Its letter in /proc (`S`, `T`, `Z`, ...), empty where there is no process or no /proc."""
+    """Return the state letter in /proc (`S`, `T`, `Z`, ...); empty without the process or /proc."""
     with suppress(FileNotFoundError, ProcessLookupError):
         return Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0]
     return ""
 
 
 def alive(pid: int) -> bool:
-    """Return whether a process runs. A zombie that is not reaped yet does not."""
+    """Return whether a process runs; a zombie does not."""
     try:
         os.kill(pid, 0)
     except ProcessLookupError:
@@ -97,7 +97,7 @@ def alive(pid: int) -> bool:
 
 
 async def reaped(pid: int) -> None:
-    """Wait until a process is gone, and a thread of asyncio has told the event loop so."""
+    """Wait until a process is gone, and asyncio's waiting thread has informed the event loop."""
     await until(lambda: not state(pid))
     await until(lambda: not any("waitpid" in each.name for each in threading.enumerate()))
     await settle()
@@ -106,13 +106,13 @@ async def reaped(pid: int) -> None:
 async def freeze(pid: int | None) -> None:
     assert pid
     os.kill(pid, signal.SIGSTOP)
-    if sys.platform == "linux":  # a signal that comes before it stands still would be the first
+    if sys.platform == "linux":  # else a later signal may arrive before the process stops
         await until(lambda: state(pid) == "T")
 
 
 PARENT = f"""
 import asyncio, json, signal, sys
-signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored, where tests run beside a shell
+signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell may have ignored it
 sys.path.insert(0, {str(ROOT)!r})
 from gigabrain_zenoh.runtime.supervisor import ProcessSpec, Supervisor
 codes = json.loads(sys.argv[1])
@@ -129,7 +129,7 @@ asyncio.run(supervisor.run())
 def another_supervisor(
     parent_code: str = PARENT, /, **codes: str
 ) -> Iterator[tuple[subprocess.Popen[str], dict[str, int]]]:
-    """A supervisor in a process of its own, with the pids of its processes, all ready."""
+    """Run a supervisor in another process; yield it and the pids of its ready processes."""
     argv = [sys.executable, "-c", parent_code, json.dumps(codes)]
     pids: dict[str, int] = {}
     with subprocess.Popen(

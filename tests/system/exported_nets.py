@@ -1,7 +1,7 @@
-"""Exports nets with random weights from their own packages, and compares boxes with these.
+"""Export nets with random weights from their own packages, and compare our boxes with theirs.
 
-Started by `test_exported_nets.py` in an environment of its own: `python exported_nets.py NAME
-FOLDER`. Prints a line of JSON: how many boxes were compared, and how far they are off at most.
+`test_exported_nets.py` starts it in a separate environment: `python exported_nets.py NAME FOLDER`.
+Prints a line of JSON: the numbers of boxes, and the largest differences.
 """
 
 import json
@@ -20,30 +20,30 @@ from gigabrain_zenoh.config.settings import RecognizerConfig
 from gigabrain_zenoh.vision.nets import load_net
 
 warnings.filterwarnings("ignore")
-WANTED = 12  # boxes, of those that are surest
-NEAR = 0.002  # of scores that are so near to the least one, either may count
-# torchvision's operators may be there for GPUs only; it is imported, and none of them is called
+WANTED_BOXES = 12  # with the highest confidence
+SCORE_TOLERANCE = 0.002  # boxes this close to the minimum score may be missing
+# torchvision may have its operators for GPUs only; it is imported, but they are not called
 OPERATORS = torch.library.Library("torchvision", "FRAGMENT")
 for operator in ("nms", "qnms"):
     if not hasattr(torch.ops.torchvision, operator):
         OPERATORS.define(f"{operator}(Tensor dets, Tensor scores, float threshold) -> Tensor")
 Boxes = tuple[np.ndarray, np.ndarray, np.ndarray]  # corners [px], labels, confidences
-Judge = Callable[[float], Boxes]  # returns all boxes that are so sure, overlapping ones as well
+Judge = Callable[[float], Boxes]  # minimum score -> boxes, overlapping ones too
 
 
 def picture() -> np.ndarray:
-    """A picture (240, 320, 3), RGB, with edges and colours."""
+    """Return an RGB picture (240, 320, 3) with edges and colours."""
     rng = np.random.default_rng(5)
     blocks = rng.integers(0, 255, (12, 16, 3), dtype=np.uint8)
     return cv2.resize(blocks, (320, 240), interpolation=cv2.INTER_CUBIC)
 
 
-def spread(model: Any) -> None:
-    """Give the scores of a YOLO net with random weights some variety, or all boxes are alike."""
+def vary_scores(model: Any) -> None:
+    """Vary the scores of a YOLO net with random weights; else all boxes are alike."""
     net = model.model
     norms = [one for one in net.modules() if isinstance(one, torch.nn.BatchNorm2d)]
     for norm in norms:
-        norm.momentum = None  # the mean of all that it sees
+        norm.momentum = None  # average all pictures
         norm.reset_running_stats()
     seen = np.stack([np.roll(picture(), 40 * n, axis=1) for n in range(4)])
     blob = torch.from_numpy(seen.transpose(0, 3, 1, 2)[:, :, :224].copy()).float() / 255
@@ -63,17 +63,17 @@ def yolo(name: str, folder: Path, **export: Any) -> tuple[Path, Judge]:
     from ultralytics.utils.ops import scale_boxes, xywh2xyxy
 
     model = YOLO(f"{name}.yaml")
-    spread(model)
+    vary_scores(model)
     made = Path(model.export(format="onnx", simplify=False, **export))
     path = made.rename(folder / f"{name}.onnx")
 
-    def judge(sure: float) -> Boxes:
+    def judge(min_score: float) -> Boxes:
         fitted = LetterBox(export["imgsz"], auto=False)(image=picture())
         blob = fitted.transpose(2, 0, 1)[None].astype(np.float32) / 255
         session = onnxruntime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
         (raw,) = session.run(None, {session.get_inputs()[0].name: blob})[0]
         scores = raw[4:].max(axis=0)
-        chosen = scores >= sure
+        chosen = scores >= min_score
         boxes = torch.from_numpy(xywh2xyxy(raw[:4].T[chosen]))
         corners = scale_boxes(export["imgsz"], boxes, (240, 320)).numpy()
         return corners, raw[4:].argmax(axis=0)[chosen], scores[chosen]
@@ -92,12 +92,12 @@ def rf_detr(folder: Path) -> tuple[Path, Judge]:
     path = Path(model.export(output_dir=str(folder)))
     cv2.imwrite(str(folder / "picture.png"), picture()[..., ::-1])
 
-    def judge(sure: float) -> Boxes:
+    def judge(min_score: float) -> Boxes:
         session = _create_onnx_session(str(path))
         found, _ = _run_inference(
             session,
             folder / "picture.png",
-            threshold=sure,
+            threshold=min_score,
             num_select=300 * 91,
             background_class_id=None,
         )
@@ -131,14 +131,14 @@ def detr(folder: Path) -> tuple[Path, Judge]:
     blank = (torch.zeros(1, 3, 256, 320),)
     torch.onnx.export(Heads(), blank, str(path), dynamo=False, opset_version=17, **names)
 
-    def judge(sure: float) -> Boxes:
+    def judge(min_score: float) -> Boxes:
         scaled = cv2.resize(picture().astype(np.float32), (320, 256)) / 255
         normal = (scaled - (0.485, 0.456, 0.406)) / (0.229, 0.224, 0.225)
         blob = torch.from_numpy(normal.astype(np.float32).transpose(2, 0, 1)[None])
         with torch.no_grad():
             made = model(pixel_values=blob)
         (found,) = DetrImageProcessor.post_process_object_detection(
-            None, made, threshold=sure, target_sizes=[(240, 320)]
+            None, made, threshold=min_score, target_sizes=[(240, 320)]
         )
         found = {key: value.numpy() for key, value in found.items()}
         sides = np.array((320, 240, 320, 240))
@@ -148,27 +148,27 @@ def detr(folder: Path) -> tuple[Path, Judge]:
 
 
 def compare(path: Path, judge: Judge, layout: str, classes: int) -> dict[str, Any]:
-    """Compare our boxes with all of the judge's.
+    """Compare our boxes with all boxes of the judge.
 
-    Returns how far ours are off one of its own, and how many of its own we have none for: the same
-    box; or, where overlapping ones are dropped, a surer one of its class that overlaps.
+    Returns the largest differences from the judge's boxes, and how many of those we miss. A box of
+    a YOLO also counts as found if we have a surer, overlapping one of its class.
     """
     (path.parent / "labels.txt").write_text("\n".join(f"class{n}" for n in range(classes)))
     labels = str(path.parent / "labels.txt")
     settings = {"onnx": str(path), "labels": labels, "layout": layout}
     most = load_net(RecognizerConfig(**settings, min_confidence=0.01)).find(picture())
-    sure = float(most.confidences[WANTED]) - 1e-6
-    found = load_net(RecognizerConfig(**settings, min_confidence=sure)).find(picture())
-    boxes, kinds, scores = judge(sure - NEAR)
+    min_score = float(most.confidences[WANTED_BOXES]) - 1e-6
+    found = load_net(RecognizerConfig(**settings, min_confidence=min_score)).find(picture())
+    boxes, kinds, scores = judge(min_score - SCORE_TOLERANCE)
     off_px, off_score = 0.0, 0.0
     for box, label, score in zip(found.boxes, found.labels, found.confidences, strict=True):
         same = np.flatnonzero(kinds == label)
         off = np.abs(boxes[same] - box).max(axis=1) + 1e4 * np.abs(scores[same] - score)
         off_px = max(off_px, float(np.abs(boxes[same[off.argmin()]] - box).max()))
         off_score = max(off_score, abs(float(scores[same[off.argmin()]]) - float(score)))
-    missed, sure_ones = 0, scores > sure + NEAR
+    missed, confident = 0, scores > min_score + SCORE_TOLERANCE
     for box, label, score in zip(
-        boxes[sure_ones], kinds[sure_ones], scores[sure_ones], strict=True
+        boxes[confident], kinds[confident], scores[confident], strict=True
     ):
         shared = overlap(found.boxes, box)
         if layout == "yolo":

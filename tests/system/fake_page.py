@@ -144,7 +144,8 @@ class Fake:
         self._published += 1
         self.robot.publish(WORLD, world, basis=self._published)
         self.robot.publish(CAMERA, REAR, name="rear")
-        person = DetectedObject(id=9, x=2.3, y=2.5, radius=0.2, label="person")  # (1.8, 1.5)
+        # (1.8, 1.5) in the map
+        person = DetectedObject(id=9, x=2.3, y=2.5, radius=0.2, label="person")
         self.robot.publish(PERCEIVED, Objects(objects=(person,)), name="people")
         self.robot.publish(SCAN, wall_ahead())
         trajectory = tuple(TrajectoryPoint(t=i / 10, x=i / 10, y=0.0, yaw=0.0) for i in range(11))

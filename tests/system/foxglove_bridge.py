@@ -1,4 +1,4 @@
-"""A Foxglove bridge in memory, beside a robot that says what a test wants."""
+"""A Foxglove bridge in memory, beside a robot whose messages the test publishes."""
 
 import asyncio
 import contextlib
@@ -22,7 +22,7 @@ from tests.system.foxglove_viewer import Viewer
 
 
 class Bridge:
-    """A robot that says what a test wants, and the bridge beside it."""
+    """The robot's bus, for the test, and the bridge beside it."""
 
     def __init__(self, folder: Path) -> None:
         self.config = FoxgloveConfig(port=free_port(), secret=str(folder / "secret"))
@@ -36,7 +36,7 @@ class Bridge:
 
     @property
     def patterns(self) -> list[str]:
-        """Return the keys that are subscribed on the bus."""
+        """Return the subscribed keys of the bus."""
         return [key for key, _ in self._network._listeners]
 
     @property
@@ -46,13 +46,13 @@ class Bridge:
     @contextlib.asynccontextmanager
     async def viewer(self) -> AsyncIterator[Viewer]:
         url = f"ws://127.0.0.1:{self.config.port}"
-        async with connect(url, subprotocols=["foxglove.sdk.v1"]) as made:  # type: ignore[list-item]
-            yield Viewer(made)
+        async with connect(url, subprotocols=["foxglove.sdk.v1"]) as socket:  # type: ignore[list-item]
+            yield Viewer(socket)
 
 
 @contextlib.asynccontextmanager
 async def bridged(folder: Path) -> AsyncIterator[Bridge]:
-    """A bridge that serves until the test is over."""
+    """Run a bridge; stop it at the end."""
     made, ready = Bridge(folder), asyncio.Event()
     serving = asyncio.ensure_future(run(made.config, made.bus, ready.set))
     await ready.wait()
@@ -65,9 +65,9 @@ async def bridged(folder: Path) -> AsyncIterator[Bridge]:
 async def hold(
     viewer: Viewer, content: object, done: Callable[[], object], seconds: float = PATIENCE_S
 ) -> None:
-    """Publish it again and again, as the Teleop panel does while a button is held.
+    """Publish `content` repeatedly until `done`, as the Teleop panel does for a held button.
 
-    Raises TimeoutError if it is not done after these seconds.
+    Raises TimeoutError after `seconds`.
     """
     async with asyncio.timeout(seconds):
         while True:

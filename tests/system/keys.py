@@ -1,4 +1,4 @@
-"""Fleets of two robots, red and blue, and sessions of whoever has which keys."""
+"""A fleet of the robots red, blue and green, its router, and sessions with given keys."""
 
 import contextlib
 import json
@@ -16,21 +16,21 @@ from gigabrain_zenoh.security.acl import FLEET_KEYS
 from gigabrain_zenoh.security.authority import issue, new_fleet
 from gigabrain_zenoh.testing.processes import free_endpoint
 
-WRITES = {  # of processes of one's own
+WRITES = {  # keys that users' own processes may write
     "mine": ("robot/intent", "robot/goal", "robot/lamp/**"),
     "ros2": FLEET_KEYS,
 }
-OF_RED: tuple[Role, ...] = ("robot", "brain", "operator", "viewer", "dispatcher")
+ROLES_OF_RED: tuple[Role, ...] = ("robot", "brain", "operator", "viewer", "dispatcher")
 
 
 def make_fleet(folder: Path, name: str) -> Path:
-    """Everybody's keys."""
+    """Issue the keys of all roles and robots; return the folder."""
     new_fleet(name, folder)
-    for role in OF_RED:
+    for role in ROLES_OF_RED:
         issue(folder, role, robot="red")
     for process in WRITES:
         issue(folder, "process", robot="red", process=process)
-    for robot in ("blue", "green"):  # of green nobody will have heard
+    for robot in ("blue", "green"):  # the router does not know green
         issue(folder, "robot", robot=robot)
     for role in ("operator", "dispatcher", "router"):
         issue(folder, role)
@@ -38,7 +38,7 @@ def make_fleet(folder: Path, name: str) -> Path:
 
 
 class Site:
-    """A router of red and blue in this process, and those who come to it."""
+    """A router for red and blue in this process, and its clients."""
 
     def __init__(self, fleet: Path) -> None:
         self.fleet, self.address = fleet, free_endpoint()
@@ -55,18 +55,18 @@ class Site:
         )
         await self._join(at)
 
-    def as_(self, name: str, namespace: str = "") -> Endpoint:
+    def endpoint_of(self, name: str, namespace: str = "") -> Endpoint:
         """Return the endpoint for a client of the router with the keys `name`."""
         keys = str(self.fleet / name)
         return Endpoint(connect=(self.address,), namespace=namespace, keys=keys)
 
     async def client(self, name: str, namespace: str = "") -> ZenohTransport:
-        """One of our processes."""
-        return await self._join(self.as_(name, namespace))
+        """Connect one of our transports with the keys `name`."""
+        return await self._join(self.endpoint_of(name, namespace))
 
     def raw(self, name: str) -> zenoh.Session:
-        """Somebody who knows nothing of this project, but has keys."""
-        return self._stack.enter_context(raw(self.as_(name)))
+        """Connect a plain Zenoh session with the keys `name`."""
+        return self._stack.enter_context(raw(self.endpoint_of(name)))
 
     async def _join(self, endpoint: Endpoint) -> ZenohTransport:
         transport = await ZenohTransport.open(endpoint)
@@ -74,13 +74,13 @@ class Site:
         return transport
 
     async def close(self) -> None:
-        """Everybody leaves."""
+        """Close the router and all clients."""
         await self._stack.aclose()
 
 
 @contextlib.asynccontextmanager
 async def site(fleet: Path) -> AsyncIterator[Site]:
-    """A router that does not outlive the test."""
+    """Run a router until the end of the test."""
     made = Site(fleet)
     try:
         await made.open()
@@ -91,7 +91,7 @@ async def site(fleet: Path) -> AsyncIterator[Site]:
 
 @contextlib.contextmanager
 def raw(endpoint: Endpoint) -> Iterator[zenoh.Session]:
-    """A bare Zenoh session. Raises ZError at once where the router does not let it in."""
+    """Open a plain Zenoh session. Raises ZError at once if the router refuses it."""
     config = zenoh.Config()
     for key, value in session_config(endpoint).items():
         config.insert_json5(key, json.dumps(value))

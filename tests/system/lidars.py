@@ -1,4 +1,4 @@
-"""Lidars on real ptys, with the Waffle at rest in the arena behind them."""
+"""Emulated lidars on real ptys, on a Waffle at rest in the arena."""
 
 import functools
 from collections.abc import AsyncIterator
@@ -22,7 +22,7 @@ LIDAR = Lidar(beams=360, rate_hz=10, range_min=0.12, range_max=3.5)
 
 
 class Wire:
-    """Collects what a device sends."""
+    """Collects the bytes of a device."""
 
     def __init__(self) -> None:
         self.sent: list[bytes] = []
@@ -33,18 +33,18 @@ class Wire:
 
 
 def waffle(world: str = "arena") -> EmulatedBody:
-    """Not started: its time stands still."""
+    """Return an emulated Waffle that is not started, so its time stands still."""
     return emulated_body("turtlebot3_waffle", Run(folder=Path(), world=world))
 
 
 @functools.cache
 def truth() -> NDArray[np.float32]:
-    """Return the scan of the simulation's own lidar, from the body's place, (360,) [m]."""
+    """Return the scan of the simulation's own lidar at the body's place, (360,) [m]."""
     return waffle().simulation.scan()
 
 
 def run_for(body: EmulatedBody, device: Device, seconds: float) -> None:
-    """Let simulated time go by, in steps of 10 ms, without waiting for it."""
+    """Advance simulated time in steps of 10 ms, without waiting."""
     for _ in range(round(seconds * 100)):
         body._step()
         device.step(body.snapshot.time_ns)
@@ -52,7 +52,7 @@ def run_for(body: EmulatedBody, device: Device, seconds: float) -> None:
 
 @asynccontextmanager
 async def emulated(device: type[Device], options: Any) -> AsyncIterator[Station]:
-    """The device on its pty, in real time."""
+    """Run a device on its pty in real time."""
     body = waffle()
     station = Station(functools.partial(device, body, options), device.port(options), Clock())
     body.start()
@@ -65,7 +65,7 @@ async def emulated(device: type[Device], options: Any) -> AsyncIterator[Station]
 
 
 class Listener:
-    """The scans of a source, from its opening to its close."""
+    """Collects the scans of a source from its opening to its close."""
 
     def __init__(self, source: SerialSource) -> None:
         self.source, self.scans = source, list[LaserScan]()
@@ -79,14 +79,14 @@ class Listener:
         await self.source.close()
 
     async def more(self, count: int) -> list[LaserScan]:
-        """The next `count` scans."""
+        """Wait for the next `count` scans and return them."""
         start = len(self.scans)
         await until(lambda: len(self.scans) >= start + count)
         return self.scans[start : start + count]
 
 
 def agree(scan: LaserScan, expected: NDArray[np.float32], within: float = 0.06) -> float:
-    """The share of beams that agree; at edges, neighbours may see one side or the other."""
+    """Return the share of beams that agree with the expected beam or one of its neighbours."""
     got, seen = (
         np.nan_to_num(values, nan=-1.0, posinf=99.0) for values in (scan.ranges_m, expected)
     )

@@ -1,10 +1,10 @@
-"""Keeps what a link brings."""
+"""Records the events of a link."""
 
 from gigabrain_drivers.links.link import Link
 
 
-class Heard:
-    """The bytes, openings and losses that a link has reported."""
+class LinkRecorder:
+    """The bytes, openings and losses that a link reported."""
 
     def __init__(self, link: Link) -> None:
         self.data, self.opened, self.lost = b"", 0, list[str]()

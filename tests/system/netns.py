@@ -1,7 +1,7 @@
 """Several hosts on one machine: network namespaces with a veth pair each, joined by a switch.
 
-The namespaces have no names. They live for as long as a process is in them, and the process that
-holds them ends when its stdin does: whatever becomes of a test, nothing of them is left.
+The namespaces have no names. They live as long as a process is in them. The process that holds
+them ends with its stdin, so nothing is left even if a test is killed.
 """
 
 import os
@@ -34,19 +34,19 @@ class Namespace:
 
     @property
     def inside(self) -> tuple[str, ...]:
-        """Return the words before a command that make it run in this namespace."""
+        """Return the prefix of a command that runs it in this namespace."""
         return ("nsenter", f"--net=/proc/{self.pid}/ns/net", "--")
 
     def close(self) -> None:
-        """Let go of it; it ends with the last process that is in it."""
+        """End the holding process; the namespace ends with its last process."""
         self._holder.communicate()
 
 
 class Network:
-    """A switch with hosts on it, and this process as one more at the address `ours`."""
+    """A switch with hosts, and this process as another host at the address `ours`."""
 
     def __init__(self, stack: ExitStack, names: Sequence[str], subnet: int) -> None:
-        net = f"198.18.{subnet}"  # set apart for such things by RFC 2544
+        net = f"198.18.{subnet}"  # reserved for tests by RFC 2544
         self._switch = _held(stack)
         self._in_switch("link", "add", "switch", "type", "bridge")
         self._in_switch("link", "set", "switch", "up")
@@ -72,11 +72,11 @@ class Network:
         return str(self._switch.pid)
 
     def join(self, name: str) -> None:
-        """Plug a host's cable in."""
+        """Connect a host to the switch."""
         self._in_switch("link", "set", name, "master", "switch", "up")
 
     def cut(self, name: str) -> None:
-        """Pull a host's cable out."""
+        """Disconnect a host from the switch."""
         self._in_switch("link", "set", name, "down")
 
     def _in_switch(self, *words: str) -> None:
@@ -90,7 +90,7 @@ def _held(stack: ExitStack) -> Namespace:
 
 
 def _ip(*words: str, inside: Namespace | None = None) -> None:
-    """One `ip` command. Raises OSError, with what the kernel has against it."""
+    """Run one `ip` command. Raises OSError with the error text of `ip`."""
     prefix = inside.inside if inside else ()
     done = subprocess.run((*prefix, "ip", *words), capture_output=True, text=True)
     if done.returncode:
@@ -99,9 +99,9 @@ def _ip(*words: str, inside: Namespace | None = None) -> None:
 
 @contextmanager
 def network(*names: str, subnet: int = 77) -> Iterator[Network]:
-    """Hosts with those names on one switch; the test is skipped where there can be none.
+    """Yield hosts with those names on one switch; skip the test where that is impossible.
 
-    Networks that are there at the same time need a `subnet` each, below 256.
+    Networks that exist at the same time need different `subnet`s, below 256.
     """
     if os.geteuid() != 0:
         pytest.skip("network namespaces need root")

@@ -92,7 +92,7 @@ class Browser:
         return page
 
     async def lose(self, file: str) -> None:
-        """Let the next request for one of the page's files fail."""
+        """Let the next request for a file of the page fail."""
         await self._context.route(f"**/{file}", lambda route: route.abort(), times=1)
 
     async def close_pages(self) -> None:

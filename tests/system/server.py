@@ -1,4 +1,4 @@
-"""Somebody behind a proxy, who hears what comes through."""
+"""A TCP server behind a proxy, which records what it receives."""
 
 import asyncio
 import contextlib
@@ -6,7 +6,7 @@ from collections.abc import AsyncIterator
 
 
 class Server:
-    """Takes what comes, and has a writer for each caller."""
+    """Records received bytes and ends of connections, and has a writer for each caller."""
 
     def __init__(self) -> None:
         self.received = bytearray()
@@ -27,10 +27,10 @@ class Server:
 
 @contextlib.asynccontextmanager
 async def serving() -> AsyncIterator[tuple[Server, int]]:
-    """A server, and the port that it listens at."""
-    served = Server()
-    listening = await asyncio.start_server(served.serve, "127.0.0.1", 0)
+    """Run a server; yield it and its port."""
+    server = Server()
+    listening = await asyncio.start_server(server.serve, "127.0.0.1", 0)
     async with listening:
-        yield served, listening.sockets[0].getsockname()[1]
-    for writer in served.writers:
+        yield server, listening.sockets[0].getsockname()[1]
+    for writer in server.writers:
         writer.close()

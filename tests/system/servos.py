@@ -19,7 +19,7 @@ from tests.unit.drivers.feetech import OPTIONS, FreeArm
 async def emulated_arm(
     port: Path, options: FeetechOptions = OPTIONS
 ) -> AsyncIterator[tuple[FeetechArm, FreeArm]]:
-    """An arm whose line appears at `port`, and whose time goes on by itself."""
+    """Run an emulated arm with its serial line at `port`, in real time."""
     clock, body = Clock(), FreeArm()
     station = Station(
         lambda wire: FeetechArm(cast(EmulatedBody, body), options, wire),

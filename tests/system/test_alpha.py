@@ -30,7 +30,7 @@ MS = 1_000_000
 
 
 class Rig:
-    """The driver, without its lidar, and the emulated body on a port of its own."""
+    """The driver without its lidar, and the emulated body on a separate port."""
 
     def __init__(self, folder: Path) -> None:
         run = Run(folder=folder, link="emulated", world="arena", emulator=str(folder))
@@ -47,7 +47,7 @@ class Rig:
         assert isinstance(self.station.device, Alpha)
         return self.station.device
 
-    async def commanding(self) -> None:
+    async def run_driver_loop(self) -> None:
         """Read the state and send the velocity every 20 ms, as the driver's process does."""
         while True:
             self.connected.append((await self.driver.read_state()).link.connected)
@@ -62,7 +62,7 @@ async def rig(tmp_path: Path) -> AsyncIterator[Rig]:
     rig.body.start()
     rig.station.start()
     async with rig.driver:
-        task = asyncio.create_task(rig.commanding())
+        task = asyncio.create_task(rig.run_driver_loop())
         await until(lambda: rig.connected[-1:] == [True])
         yield rig
         task.cancel()
@@ -71,14 +71,14 @@ async def rig(tmp_path: Path) -> AsyncIterator[Rig]:
     await rig.body.close()
 
 
-async def test_the_real_driver_walks_the_emulated_body_ahead_and_sideways(rig: Rig) -> None:
+async def test_the_real_driver_moves_the_emulated_body_ahead_and_sideways(rig: Rig) -> None:
     received = list[object]()
     rig.driver.emit = lambda topic, message: received.append(topic)
     rig.streaming = (0.3, 0.1, 0.0)
     truth = rig.body.simulation.truth
     start = truth.pose()
     await until(lambda: truth.distance_m > 0.5)
-    told = rig.device.executed[-1]
+    executed_gait = rig.device.executed[-1]
     rig.streaming = (0.0, 0.0, 0.0)
     await until(lambda: rig.body.commanded == (0.0, 0.0, 0.0) and abs(truth.speed()[0]) < 0.01)
     stood_ns = rig.body.snapshot.time_ns
@@ -92,10 +92,10 @@ async def test_the_real_driver_walks_the_emulated_body_ahead_and_sideways(rig: R
     assert state.battery
     assert 28 < state.battery.voltage < 30
     assert IMU in received
-    assert WALKER.to_body(told) == pytest.approx((0.3, 0.1, 0.0), abs=1e-6)
+    assert WALKER.to_body(executed_gait) == pytest.approx((0.3, 0.1, 0.0), abs=1e-6)
 
 
-async def test_it_returns_what_it_sent_within_the_limits_and_nothing_that_is_no_number(
+async def test_it_returns_the_sent_velocity_within_limits_and_zero_for_nan(
     rig: Rig,
 ) -> None:
     rig.streaming = None
@@ -105,7 +105,7 @@ async def test_it_returns_what_it_sent_within_the_limits_and_nothing_that_is_no_
     assert (none.linear_x, none.linear_y, none.angular_z) == (0.0, 0.0, 0.0)
 
 
-async def test_when_the_stream_stops_the_body_stops(rig: Rig) -> None:
+async def test_the_body_stops_without_commands(rig: Rig) -> None:
     rig.streaming = (0.3, 0.0, 0.0)
     await until(lambda: rig.device.executed and rig.device.executed[-1].stride_x > 0)
     rig.streaming = None
@@ -113,7 +113,7 @@ async def test_when_the_stream_stops_the_body_stops(rig: Rig) -> None:
     await until(lambda: abs(rig.body.simulation.truth.speed()[0]) < 0.05)
 
 
-async def test_a_body_that_falls_silent_is_lost_and_comes_back_with_a_stop(rig: Rig) -> None:
+async def test_a_silent_body_is_lost_and_gets_a_stop_first_when_it_returns(rig: Rig) -> None:
     rig.streaming = (0.3, 0.0, 0.0)
     await until(lambda: rig.device.executed and rig.device.executed[-1].stride_x > 0)
     rig.station.set(Faults(silence=True))
@@ -127,7 +127,7 @@ async def test_a_body_that_falls_silent_is_lost_and_comes_back_with_a_stop(rig: 
     await until(lambda: rig.connected[-1])
 
 
-async def test_unplugged_and_plugged_in_again_it_is_found_again(rig: Rig) -> None:
+async def test_a_replugged_body_is_found_again(rig: Rig) -> None:
     rig.station.set(Faults(unplugged=True))
     await until(lambda: not rig.connected[-1])
     assert rig.driver.link.problem
@@ -136,7 +136,7 @@ async def test_unplugged_and_plugged_in_again_it_is_found_again(rig: Rig) -> Non
     assert rig.driver.link.reconnects >= 1
 
 
-async def test_a_frozen_body_is_dropped_and_executes_nothing_old_when_it_thaws(rig: Rig) -> None:
+async def test_a_thawed_body_executes_no_old_commands(rig: Rig) -> None:
     rig.streaming = (0.3, 0.0, 0.0)
     await until(lambda: rig.device.executed and rig.device.executed[-1].stride_x > 0)
     rig.station.set(Faults(frozen=True))
@@ -149,16 +149,18 @@ async def test_a_frozen_body_is_dropped_and_executes_nothing_old_when_it_thaws(r
     assert all(gait.stride_x == 0.0 for gait in rig.device.executed)
 
 
-async def test_byte_errors_lose_frames_and_nothing_else(rig: Rig) -> None:
+async def test_bit_errors_only_lose_frames(rig: Rig) -> None:
     rig.streaming = (0.2, 0.0, 0.0)
     rig.station.set(Faults(bit_errors=0.005))
     await until(lambda: rig.driver.link.errors > 5)
-    told = {round(gait.stride_x, 4) for gait in rig.device.executed}
-    assert told <= {0.0, round(0.2 / 3.6, 4)}
+    strides = {round(gait.stride_x, 4) for gait in rig.device.executed}
+    assert strides <= {0.0, round(0.2 / 3.6, 4)}
     await until(lambda: rig.connected[-1])
 
 
-async def test_one_client_at_a_time(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_the_emulator_serves_one_client_at_a_time(
+    rig: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
     assert rig.port.address
     loop = asyncio.get_running_loop()
     with socket.socket() as other:
@@ -167,14 +169,14 @@ async def test_one_client_at_a_time(rig: Rig, monkeypatch: pytest.MonkeyPatch) -
         assert await loop.sock_recv(other, 10) == b""
     assert rig.port.refused == 1
     await until(lambda: rig.connected[-1])
-    monkeypatch.setattr(ports, "CLIENT_TIMEOUT_NS", 0)  # as if the first had been silent for long
+    monkeypatch.setattr(ports, "CLIENT_TIMEOUT_NS", 0)  # the first client counts as silent
     with socket.socket() as other:
         other.setblocking(False)
         await loop.sock_connect(other, rig.port.address)
         assert (await loop.sock_recv(other, 10))[:2] == alpha.MAGIC
 
 
-async def test_the_second_emulator_takes_another_port(tmp_path: Path) -> None:
+async def test_a_second_emulator_uses_another_port(tmp_path: Path) -> None:
     first = TcpPort(tmp_path / "one", 0)
     first.plug()
     assert first.address
@@ -190,7 +192,7 @@ async def test_the_second_emulator_takes_another_port(tmp_path: Path) -> None:
     assert os.listdir(tmp_path) == []
 
 
-async def test_without_a_body_it_opens_says_so_and_closes(tmp_path: Path) -> None:
+async def test_without_a_body_the_driver_opens_reports_and_closes(tmp_path: Path) -> None:
     options = AlphaOptions(driver="alpha", port=str(tmp_path / "base"))
     driver = AlphaDriver(catalog.load_robot("alpha"), options, Run(folder=tmp_path))
     await driver.stop()
@@ -205,7 +207,7 @@ async def test_without_a_body_it_opens_says_so_and_closes(tmp_path: Path) -> Non
     await driver.close()
 
 
-def test_the_robot_has_all_three_links() -> None:
+def test_alpha_has_all_three_links() -> None:
     robot, driver, options, _ = catalog.load_link("alpha", Run(folder=Path(), link="real"))
     assert driver is AlphaDriver
     assert isinstance(options, AlphaOptions)
@@ -216,7 +218,7 @@ def test_the_robot_has_all_three_links() -> None:
 
 
 @pytest.mark.slow
-async def test_parked_it_lies_and_a_new_driver_leaves_it_lying(rig: Rig) -> None:
+async def test_a_parked_body_stays_down_when_its_driver_reconnects(rig: Rig) -> None:
     rig.driver.robot = replace(rig.driver.robot, safe_state="park")
     rig.streaming = (0.3, 0.0, 0.0)
     truth = rig.body.simulation.truth

@@ -1,4 +1,4 @@
-"""Arithmetic of numpy: the same on every x86-64 processor for recorded drives, in one thread."""
+"""Arithmetic of numpy: equal on every x86-64 processor for recorded drives, in one thread."""
 
 import os
 import platform
@@ -9,7 +9,7 @@ import pytest
 
 from gigabrain_zenoh.recording.arithmetic import X86_64
 
-SHOW = """
+SHOW_WIDE_FEATURES = """
 import gigabrain_zenoh.recording.arithmetic
 import numpy
 from numpy._core._multiarray_umath import __cpu_dispatch__, __cpu_features__
@@ -19,24 +19,29 @@ print([name for name in wide if __cpu_features__[name]])
 
 
 @pytest.mark.skipif(platform.machine() not in X86_64, reason="other processors compute as they do")
-def test_numpy_leaves_out_what_not_every_processor_has() -> None:
-    told = {name: os.environ[name] for name in ("OPENBLAS_CORETYPE", "NPY_DISABLE_CPU_FEATURES")}
-    assert told["OPENBLAS_CORETYPE"]
+def test_numpy_uses_no_instructions_that_some_processors_lack() -> None:
+    settings = {
+        name: os.environ[name] for name in ("OPENBLAS_CORETYPE", "NPY_DISABLE_CPU_FEATURES")
+    }
+    assert settings["OPENBLAS_CORETYPE"]
     done = subprocess.run(
-        (sys.executable, "-W", "error", "-c", SHOW), capture_output=True, text=True, check=True
+        (sys.executable, "-W", "error", "-c", SHOW_WIDE_FEATURES),
+        capture_output=True,
+        text=True,
+        check=True,
     )
     assert done.stdout.strip() == "[]"
 
 
-# what comes before `multiply_in_one_thread` must not import numpy; nor is MuJoCo needed for options
-QUICK = """
+# code before `multiply_in_one_thread` must not import numpy; options must not import MuJoCo
+SHOW_HEAVY_IMPORTS = """
 import sys
 import gigabrain_zenoh.cli.app, gigabrain_zenoh.launch.processes
 print([name for name in ("numpy", "mujoco") if name in sys.modules])
 import gigabrain_drivers.sim.driver
 print("mujoco" in sys.modules)
 """
-THREADS = """
+SHOW_THREADS = """
 import os
 from gigabrain_zenoh.host.this_process import multiply_in_one_thread
 multiply_in_one_thread()
@@ -45,18 +50,18 @@ print(os.environ["OPENBLAS_NUM_THREADS"], len(os.listdir("/proc/self/task")))
 """
 
 
-def printed(code: str, **env: str) -> str:
-    """Return the output of a program that starts with numpy's own settings, except for `env`."""
+def output_of(code: str, **env: str) -> str:
+    """Return the output of a program that starts with default settings of numpy and `env`."""
     own = {name: value for name, value in os.environ.items() if name != "OPENBLAS_NUM_THREADS"}
     command = (sys.executable, "-W", "error", "-c", code)
     return subprocess.run(command, capture_output=True, text=True, check=True, env=own | env).stdout
 
 
-def test_commands_and_processes_begin_without_numpy_and_mujoco() -> None:
-    assert printed(QUICK).split("\n") == ["[]", "False", ""]
+def test_commands_and_processes_start_without_numpy_and_mujoco() -> None:
+    assert output_of(SHOW_HEAVY_IMPORTS).split("\n") == ["[]", "False", ""]
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="threads are counted in /proc")
-def test_matrices_are_multiplied_in_one_thread_unless_the_environment_says_otherwise() -> None:
-    assert printed(THREADS).split() == ["1", "1"]
-    assert printed(THREADS, OPENBLAS_NUM_THREADS="2").split()[0] == "2"
+def test_matrices_are_multiplied_in_one_thread_unless_the_environment_sets_more() -> None:
+    assert output_of(SHOW_THREADS).split() == ["1", "1"]
+    assert output_of(SHOW_THREADS, OPENBLAS_NUM_THREADS="2").split()[0] == "2"

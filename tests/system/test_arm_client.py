@@ -18,7 +18,7 @@ MODEL = ArmKinematics(
     robot_path("so101").with_name("model.xml").read_text(), load_robot("so101").joints
 )
 HOME = load_robot("so101").arm.home  # type: ignore[union-attr]
-NEAR = 0.06  # [rad]: the goal tolerance, and an encoder's step
+TOLERANCE_RAD = 0.06  # goal tolerance plus an encoder step
 
 
 @pytest.fixture(scope="module")
@@ -40,33 +40,35 @@ def posture(arm: Probe) -> tuple[float, ...]:
     return tuple(joint.position for joint in arm.state.joints)
 
 
-async def test_it_is_enabled_and_holds_still_for_its_brain(arm: Probe) -> None:
+async def test_an_enabled_arm_holds_still(arm: Probe) -> None:
     await arm.ticks(50)
     assert arm.state.gate.commander == "control"
     assert posture(arm) == pytest.approx(HOME, abs=0.03)
     assert arm.state.joints_sent == pytest.approx(HOME, abs=0.03)
 
 
-async def test_a_script_moves_joints_and_they_stay_there(arm: Probe) -> None:
+async def test_a_script_moves_joints_which_stay_there_afterwards(arm: Probe) -> None:
     async with connect(take=True, source="reach") as script:
         found = await script.set_joint_positions({"shoulder_pan": 0.6, "elbow_flex": 1.0})
-        assert found["shoulder_pan"] == pytest.approx(0.6, abs=NEAR)
-        assert found["elbow_flex"] == pytest.approx(1.0, abs=NEAR)
-        assert found["shoulder_lift"] == pytest.approx(HOME[1], abs=NEAR)
-        assert await script.set_joint_position("gripper", 0.5) == pytest.approx(0.5, abs=NEAR)
+        assert found["shoulder_pan"] == pytest.approx(0.6, abs=TOLERANCE_RAD)
+        assert found["elbow_flex"] == pytest.approx(1.0, abs=TOLERANCE_RAD)
+        assert found["shoulder_lift"] == pytest.approx(HOME[1], abs=TOLERANCE_RAD)
+        assert await script.set_joint_position("gripper", 0.5) == pytest.approx(
+            0.5, abs=TOLERANCE_RAD
+        )
         await arm.ticks(25)
         assert arm.state.joints_sent[0] == pytest.approx(0.6, abs=0.01)
         assert {joint.name for joint in await script.get_joint_states()} == set(found)
         found = await script.set_joint_trajectory(
             [(0.5, {"shoulder_pan": 0.3}), (1.5, {"shoulder_pan": -0.5})]
         )
-        assert found["shoulder_pan"] == pytest.approx(-0.5, abs=NEAR)
+        assert found["shoulder_pan"] == pytest.approx(-0.5, abs=TOLERANCE_RAD)
     await until(lambda: arm.state.gate.commander == "control", "the brain goes on")
     await arm.ticks(25)
     assert arm.state.joints_sent[0] == pytest.approx(-0.5, abs=0.02)
 
 
-async def test_what_a_joint_cannot_do_is_refused_and_nothing_moves(arm: Probe) -> None:
+async def test_impossible_joint_commands_are_refused_and_move_nothing(arm: Probe) -> None:
     before = posture(arm)
     async with connect(take=True, source="wrong") as script:
         with pytest.raises(UnknownName, match="no joint 'elbow'; did you mean 'elbow_flex'"):
@@ -92,7 +94,7 @@ async def test_what_a_joint_cannot_do_is_refused_and_nothing_moves(arm: Probe) -
         assert posture(arm) == pytest.approx(before, abs=0.01)
 
 
-async def test_an_estop_holds_the_arm_where_it_is(arm: Probe) -> None:
+async def test_an_estop_holds_the_arm_at_its_position(arm: Probe) -> None:
     async with connect(take=True, source="stopped") as script:
         await script.set_joint_position("shoulder_pan", -1.0, speed=1.0)
         await script.set_joint_position("shoulder_pan", 1.0, speed=0.5, wait=False)
@@ -109,10 +111,12 @@ async def test_an_estop_holds_the_arm_where_it_is(arm: Probe) -> None:
         await script.release()
         await script.enable(take=True)
         assert posture(arm) == pytest.approx(there, abs=0.01)
-        assert await script.set_joint_position("shoulder_pan", 0.0) == pytest.approx(0, abs=NEAR)
+        assert await script.set_joint_position("shoulder_pan", 0.0) == pytest.approx(
+            0, abs=TOLERANCE_RAD
+        )
 
 
-async def test_a_limp_arm_falls_by_a_persons_word_and_holds_again(arm: Probe) -> None:
+async def test_an_arm_can_be_made_limp_on_request_and_held_again(arm: Probe) -> None:
     async with connect(take=True, source="letting-go") as script:
         stretched = {"shoulder_lift": 0.0, "elbow_flex": 0.0, "wrist_flex": 0.0}
         await script.set_joint_positions(stretched)
@@ -160,11 +164,13 @@ async def test_commands_show_and_move_the_arm(shared_home: Home, arm: Probe) -> 
     assert (await jogged.ended(), jogged.out[:17]) == (0, "wrist_roll is at "), jogged.err
     at_home = await shared_home.run("arm", "home", "--take")
     assert await at_home.ended() == 0, at_home.err
-    assert posture(arm) == pytest.approx(HOME, abs=NEAR)
+    assert posture(arm) == pytest.approx(HOME, abs=TOLERANCE_RAD)
 
 
 @pytest.mark.slow
-async def test_the_tools_miss_no_scans_worlds_or_wheels(shared_home: Home, arm: Probe) -> None:
+async def test_the_tools_report_no_missing_scans_worlds_or_wheels(
+    shared_home: Home, arm: Probe
+) -> None:
     await until(lambda: arm.state.gate.commander == "control", "the brain goes on")
     why = await shared_home.run("why")
     links = dict(line.split()[:2] for line in why.out.splitlines() if line.startswith("  "))
@@ -195,7 +201,7 @@ async def test_a_wrong_command_is_one_clear_line(
 
 
 @pytest.mark.slow
-async def test_decision_reaches_a_point_and_says_what_it_cannot(arm: Probe) -> None:
+async def test_decision_reaches_a_point_and_refuses_an_impossible_one(arm: Probe) -> None:
     async with connect(source="tasks") as robot:
         task = await robot.tasks.carry_out("do: [{reach: [0.22, 0.05, 0.12]}]")
         done = await robot.tasks.result(task)
@@ -213,4 +219,4 @@ async def test_decision_reaches_a_point_and_says_what_it_cannot(arm: Probe) -> N
             await robot.tasks.go_to(1.0, 0.0)
         home = await robot.tasks.carry_out("do: [{posture: home}]")
         assert (await robot.tasks.result(home)).state == "succeeded"
-    assert posture(arm) == pytest.approx(HOME, abs=NEAR)
+    assert posture(arm) == pytest.approx(HOME, abs=TOLERANCE_RAD)

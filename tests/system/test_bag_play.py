@@ -1,4 +1,4 @@
-"""Playing a recording: complete, in time, and harmless beside a robot."""
+"""Playing a recording: completely, in time, and harmlessly beside a robot."""
 
 import asyncio
 from pathlib import Path
@@ -30,7 +30,7 @@ pytestmark = pytest.mark.system
 
 @pytest.fixture(scope="module")
 def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """2 s: a map at the start, states and scans."""
+    """Return a recording of 2 s: a map at the start, states and scans."""
     path = tmp_path_factory.mktemp("bag") / "drive.mcap"
     grid = bags.arrival(1, "robot/map", codec.encode(example(MAP.type)))
     assert bags.write(path, iter([grid, *bags.drive(100)])) == 121
@@ -38,7 +38,7 @@ def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.parametrize("rate", [1.0, 2.0])
-async def test_nothing_is_dropped(drive: Path, rate: float) -> None:
+async def test_playing_drops_no_message(drive: Path, rate: float) -> None:
     async with robot() as network:
         await network.router()
         ear, mouth = await network.client(), await network.client()
@@ -60,7 +60,7 @@ async def test_from_the_middle_the_map_comes_first_and_late_joiners_get_it(drive
     player = Player(drive, PlayOptions(rate=100.0, start_s=1.0), network.transport())
     await player.play()
     keys = [key for key, _ in network.sent]
-    assert sorted(keys[:2]) == ["robot/map", "robot/state"]  # the newest of what is kept
+    assert sorted(keys[:2]) == ["robot/map", "robot/state"]  # the newest kept messages
     assert keys[2:].count("robot/state") == 50
     assert keys.count("robot/scan") == 11
     late = Bus(network.transport(), Clock())
@@ -68,7 +68,7 @@ async def test_from_the_middle_the_map_comes_first_and_late_joiners_get_it(drive
     await late.close()
 
 
-async def test_it_can_be_looped_chosen_from_and_sent_on_other_keys(drive: Path) -> None:
+async def test_playing_can_loop_choose_topics_and_remap_keys(drive: Path) -> None:
     network = LocalNetwork()
     remap = {"robot/scan": "old/scan"}
     options = PlayOptions(rate=100.0, loop=True, topics=("scan",), remap=remap)
@@ -80,21 +80,21 @@ async def test_it_can_be_looped_chosen_from_and_sent_on_other_keys(drive: Path) 
     assert network.sent[0] == network.sent[20]
 
 
-async def test_each_round_of_a_loop_is_like_the_first(tmp_path: Path) -> None:
+async def test_each_round_of_a_loop_equals_the_first(tmp_path: Path) -> None:
     path, grid = tmp_path / "maps.mcap", example(MAP.type)
     maps = [codec.encode(replace(grid, seq=seq)) for seq in (1, 2)]
-    told = [("robot/scan", bags.scan(1)), *(("robot/map", each) for each in maps)]
-    bags.write(path, (bags.arrival(n * 10**9, *each) for n, each in enumerate(told)))
+    expected = [("robot/scan", bags.scan(1)), *(("robot/map", each) for each in maps)]
+    bags.write(path, (bags.arrival(n * 10**9, *each) for n, each in enumerate(expected)))
     network = LocalNetwork()
     options = PlayOptions(rate=100.0, loop=True)
     playing = asyncio.ensure_future(Player(path, options, network.transport()).play())
     await until(lambda: len(network.sent) >= 6)
     playing.cancel()
     await asyncio.wait((playing,))
-    assert network.sent[:6] == told * 2
+    assert network.sent[:6] == expected * 2
 
 
-async def test_a_single_message_is_not_repeated_without_a_pause(
+async def test_a_loop_over_a_single_message_pauses_between_rounds(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pauses: list[float] = []
@@ -117,7 +117,7 @@ async def test_a_single_message_is_not_repeated_without_a_pause(
     assert pauses.count(0.05) >= 19
 
 
-async def test_what_a_recorder_appends_meanwhile_is_not_played(tmp_path: Path) -> None:
+async def test_messages_appended_during_playing_are_not_played(tmp_path: Path) -> None:
     network, file = LocalNetwork(), BagWriter(tmp_path / "a.mcap", viewers=False, notes={})
     growing = Player(file.path, PlayOptions(rate=100.0), network.transport())
 
@@ -127,7 +127,7 @@ async def test_what_a_recorder_appends_meanwhile_is_not_played(tmp_path: Path) -
 
     append("robot/state", bags.state(1))
     playing = asyncio.ensure_future(growing.play())
-    await asyncio.sleep(0)  # it has read the file, and waits for subscribers
+    await asyncio.sleep(0)  # the file is read; playing waits for subscribers
     append("robot/state", bags.state(2))
     append("robot/scan", bags.scan(1))
     await playing
@@ -135,7 +135,7 @@ async def test_what_a_recorder_appends_meanwhile_is_not_played(tmp_path: Path) -
     assert network.sent == [("robot/state", bags.state(1))]
 
 
-async def test_the_pace_is_that_of_the_recording(drive: Path) -> None:
+async def test_playing_keeps_the_timing_of_the_recording(drive: Path) -> None:
     network = LocalNetwork()
     loop = asyncio.get_running_loop()
     began_s = loop.time()
@@ -143,7 +143,7 @@ async def test_the_pace_is_that_of_the_recording(drive: Path) -> None:
     assert loop.time() - began_s >= 2.0 / 4.0
 
 
-async def test_where_a_driver_runs_playing_is_refused() -> None:
+async def test_playing_beside_a_running_driver_is_refused() -> None:
     net = Net()
     await check_no_driver(net.one)
 
@@ -157,13 +157,13 @@ async def test_where_a_driver_runs_playing_is_refused() -> None:
     await net.two.close()
 
 
-async def test_recorded_commands_do_not_move_a_living_robot(tmp_path: Path) -> None:
+async def test_played_commands_do_not_move_a_running_robot(tmp_path: Path) -> None:
     async with RobotInMemory(tmp_path / "state", resume="manual") as living:
         await living.go(50)
         assert living.state
         path = tmp_path / "commands.mcap"
         file = BagWriter(path, viewers=False, notes={})
-        for seq in range(1, 101):  # of an earlier start: everything is right but the boot
+        for seq in range(1, 101):  # valid except for their boot, an earlier one
             command = CMD_VEL.type(
                 linear_x=0.2, source="script", seq=seq,
                 boot=living.state.boot ^ 1, tick=living.state.tick + seq // 2,

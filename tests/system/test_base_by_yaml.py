@@ -50,7 +50,7 @@ sim: {driver: mujoco}
 """
 
 
-def written(folder: Path, head: str, model_of: str, lines: str = LINES) -> str:
+def robot_file(folder: Path, head: str, model_of: str, lines: str = LINES) -> str:
     folder.mkdir()
     model = robot_path(model_of).with_name("model.xml")
     (folder / "model.xml").write_text(model.read_text())
@@ -58,15 +58,15 @@ def written(folder: Path, head: str, model_of: str, lines: str = LINES) -> str:
     return str(folder / "robot.yaml")
 
 
-def test_the_example_of_the_docs_is_this_one() -> None:
+def test_the_example_in_the_docs_equals_this_file() -> None:
     page = (ROOT / "docs" / "reference" / "firmware_line.md").read_text()
     assert FOUR_WHEELS + LINES in page
 
 
 @pytest.mark.slow
-async def test_a_board_with_whole_revolutions_and_ticks_passes_the_kit(tmp_path: Path) -> None:
-    two = written(tmp_path / "two", TWO_WHEELS, "turtlebot3_waffle")
-    four = written(tmp_path / "four", FOUR_WHEELS, "skid_rover")
+async def test_a_base_with_integer_rpm_and_ticks_passes_the_conformance_kit(tmp_path: Path) -> None:
+    two = robot_file(tmp_path / "two", TWO_WHEELS, "turtlebot3_waffle")
+    four = robot_file(tmp_path / "four", FOUR_WHEELS, "skid_rover")
     checked = await asyncio.gather(
         *(
             kit.check(name, "emulated", tmp_path / f"kit{i}", lambda result: None)
@@ -91,11 +91,11 @@ async def test_a_board_with_whole_revolutions_and_ticks_passes_the_kit(tmp_path:
         (",{wheel_right_position|tick}", "", "must stand in one line"),
     ],
 )
-def test_lines_that_do_not_fit_are_refused_with_the_line_of_the_file(
+def test_invalid_line_templates_are_refused_with_their_line(
     tmp_path: Path, old: str, new: str, problem: str
 ) -> None:
     assert old in LINES
-    file = written(tmp_path / "four", FOUR_WHEELS, "skid_rover", LINES.replace(old, new))
+    file = robot_file(tmp_path / "four", FOUR_WHEELS, "skid_rover", LINES.replace(old, new))
     with pytest.raises(ConfigError) as refused:
         load_link(file, Run(folder=Path(), link="emulated"))
     assert problem in str(refused.value)

@@ -1,4 +1,4 @@
-"""The benches: what they make of figures, what they show, and the commands on a robot."""
+"""The benchmark commands on a real robot's processes, and their refusals."""
 
 import json
 from pathlib import Path
@@ -10,8 +10,10 @@ from gigabrain_zenoh.testing.processes import Home
 
 
 @pytest.mark.slow
-async def test_the_chain_is_timed_beside_relays(home: Home, tmp_path: Path) -> None:
-    """Those of dora and rospy run where they are; CI has rospy."""
+async def test_the_latency_of_the_chain_is_measured_beside_relays(
+    home: Home, tmp_path: Path
+) -> None:
+    """The relays of dora and rospy run where these are installed; CI has rospy."""
     report = tmp_path / "chain.json"
     options = ("--seconds", "1", "--rounds", "1", "--rates", "50", "--peers", "--json", str(report))
     command = await home.run("bench", "chain", *options)
@@ -38,7 +40,7 @@ async def test_a_whole_robot_is_measured(home: Home, tmp_path: Path) -> None:
     pytest.importorskip("gtsam")
     report = tmp_path / "stack.json"
     command = home.start("bench", "stack", "--seconds", "2", "--goal", "--json", str(report))
-    assert await command.ended(600.0) == 0, command.err  # where nothing is kept yet, it compiles
+    assert await command.ended(600.0) == 0, command.err  # the first run compiles
     result = json.loads(report.read_bytes())
     names = [process["name"] for process in result["processes"]]
     assert names == ["router", "driver", "perception", "decision", "control", "safety"]
@@ -53,7 +55,9 @@ async def test_a_whole_robot_is_measured(home: Home, tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-async def test_an_arm_s_stack_is_measured_while_it_moves_things(home: Home, tmp_path: Path) -> None:
+async def test_the_processes_of_an_arm_are_measured_while_it_moves_things(
+    home: Home, tmp_path: Path
+) -> None:
     pytest.importorskip("mujoco")
     report = tmp_path / "arm.json"
     options = ("--body", "so101", "--link", "emulated", "--seconds", "5", "--json", str(report))
@@ -73,7 +77,7 @@ async def test_an_arm_s_stack_is_measured_while_it_moves_things(home: Home, tmp_
         (("stack", "--body", "turtlebot3_wafle"), "did you mean 'turtlebot3_waffle'?"),
     ],
 )
-async def test_what_cannot_be_measured_is_refused(
+async def test_impossible_measurements_are_refused(
     home: Home, options: tuple[str, ...], complaint: str
 ) -> None:
     command = await home.run("bench", *options)

@@ -1,4 +1,4 @@
-"""A robot with cameras: pictures on the bus, a process that dies, and a machine without OpenGL."""
+"""A robot with cameras: pictures on the bus, a dying process, and a machine without OpenGL."""
 
 import json
 import os
@@ -30,7 +30,7 @@ def can_draw() -> bool:
 
 @pytest.mark.slow
 @pytest.mark.skipif(not can_draw(), reason="there is no OpenGL here")
-async def test_a_demo_with_cameras_gives_picture_depth_and_info_also_after_a_death(
+async def test_a_demo_with_cameras_publishes_pictures_also_after_a_restart(
     home: Home,
 ) -> None:
     demo = home.start(*AVOID, "--cameras", "--headless")
@@ -54,7 +54,7 @@ async def test_a_demo_with_cameras_gives_picture_depth_and_info_also_after_a_dea
         assert decoded(newest(IMAGE)).shape == (240, 320, 3)
         depth = newest(DEPTH).array()
         assert depth.shape == (240, 320)
-        assert 0.2 < (depth > 0).mean() < 0.99  # the floor at least, and holes
+        assert 0.2 < (depth > 0).mean() < 0.99  # the floor has a depth, the sky has none
         assert newest(CAMERA).camera == load_robot("turtlebot3_waffle").cameras[0]
         ticks: list[Message] = received[DEPTH.at("front")][-5:]
         assert all(one.tick == one.basis and one.tick % 5 == 0 for one in ticks)
@@ -67,19 +67,19 @@ async def test_a_demo_with_cameras_gives_picture_depth_and_info_also_after_a_dea
         await until(lambda: home.processes("camera") not in ([pid], []), "another process")
         before, boot = pictures(), newest(IMAGE).boot
         await until(lambda: pictures() > before + 5, "pictures again")
-        assert newest(IMAGE).boot == boot  # the driver went on
+        assert newest(IMAGE).boot == boot  # the driver did not restart
     demo.send(signal.SIGINT)
     assert await demo.ended() == 0
 
 
 @pytest.mark.slow
-async def test_without_opengl_one_line_says_so_and_the_robot_drives_as_without_cameras(
+async def test_without_opengl_the_robot_drives_without_cameras_with_one_warning(
     home: Home, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     reports = []
     for cameras in ((), ("--cameras",)):
         monkeypatch.setenv("MUJOCO_GL", "egl")
-        monkeypatch.setenv("PYOPENGL_PLATFORM", "glx")  # which EGL refuses
+        monkeypatch.setenv("PYOPENGL_PLATFORM", "glx")  # EGL refuses it
         path = home.folder / f"report{len(cameras)}.json"
         options = ("--headless", "--seconds", "6", "--speed", "10", "--lockstep-timeout", "30")
         demo = await home.run(*AVOID, *options, "--report", str(path), *cameras)
@@ -87,19 +87,21 @@ async def test_without_opengl_one_line_says_so_and_the_robot_drives_as_without_c
         assert ("apt-get install" in demo.err) is bool(cameras)
         assert len(demo.err.splitlines()) == len(cameras)
         assert demo.out.count("camera") == 0
-        reports.append(told(path))
+        reports.append(machine_independent_results(path))
     assert reports[0] == reports[1]
 
 
-def told(path: Path) -> dict[str, Any]:
-    """Return the results of a run that do not depend on how fast this machine is."""
+def machine_independent_results(path: Path) -> dict[str, Any]:
+    """Return the results of a run that do not depend on the speed of this machine."""
     report = json.loads(path.read_bytes())
     names = ("sim_seconds", "distance_m", "turns", "min_clearance_m", "contacts", "true_x")
     return {name: report.get(name) for name in names}
 
 
 @pytest.mark.parametrize("options", [("--body", "turtlebot3_burger"), ("--body", "mock")])
-async def test_a_body_without_cameras_says_so(home: Home, options: tuple[str, ...]) -> None:
+async def test_cameras_for_a_body_without_them_are_refused(
+    home: Home, options: tuple[str, ...]
+) -> None:
     demo = await home.run(*AVOID, "--headless", "--cameras", *options)
     assert await demo.ended() == 2
     assert "has no cameras; add a part `cameras:`" in demo.err

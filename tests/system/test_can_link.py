@@ -1,4 +1,4 @@
-"""A CAN link: frames both ways on a real bus, its loss, and what is said where there is none."""
+"""A CAN link: frames both ways on a real bus, its loss, and errors without a bus."""
 
 import socket
 from collections.abc import AsyncIterator
@@ -52,7 +52,7 @@ async def test_frames_go_both_ways_in_order(port: CanPort, link: CanLink) -> Non
     assert [frame for frame in there if frame != FRAME] == sent
 
 
-async def test_datagrams_that_are_no_frames_are_counted(port: CanPort, link: CanLink) -> None:
+async def test_invalid_datagrams_are_counted(port: CanPort, link: CanLink) -> None:
     here = list[CanFrame]()
     link.on_bytes = lambda data: here.extend(CanDecoder().feed(data))
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:
@@ -65,7 +65,7 @@ async def test_datagrams_that_are_no_frames_are_counted(port: CanPort, link: Can
     assert link.connected
 
 
-async def test_a_bus_that_goes_silent_is_opened_again(port: CanPort) -> None:
+async def test_a_silent_bus_is_reopened(port: CanPort) -> None:
     link, lost = CanLink(str(port.path), Clock(), quiet_ns=100_000_000), list[str]()
     link.on_lost = lost.append
     link.open()
@@ -80,7 +80,7 @@ async def test_a_bus_that_goes_silent_is_opened_again(port: CanPort) -> None:
     assert link.problem == "closed"
 
 
-async def test_an_interface_that_is_missing_has_one_line(tmp_path: Path) -> None:
+async def test_a_missing_interface_is_reported_in_one_line(tmp_path: Path) -> None:
     link = CanLink("can_nowhere", Clock())
     link.open()
     await until(lambda: link.problem.startswith("no CAN interface can_nowhere"))
@@ -88,10 +88,10 @@ async def test_an_interface_that_is_missing_has_one_line(tmp_path: Path) -> None
     await link.close()
 
 
-async def test_an_interface_is_opened_with_filters_by_the_kernel(
+async def test_an_interface_is_opened_with_kernel_filters(
     port: CanPort, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """SocketCAN itself is not everywhere; what python-can is asked for is."""
+    """SocketCAN is not available everywhere, so only the request to python-can is checked."""
     asked = list[dict[str, Any]]()
 
     def bus(**options: Any) -> can.BusABC:
@@ -108,7 +108,9 @@ async def test_an_interface_is_opened_with_filters_by_the_kernel(
     assert asked[0] == {"interface": "socketcan", "channel": "can0", "can_filters": filters}
 
 
-async def test_an_interface_that_cannot_be_opened_says_why(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_an_interface_that_cannot_be_opened_is_reported_with_the_reason(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     def bus(**_: Any) -> can.BusABC:
         raise OSError(97, "Address family not supported by protocol")
 

@@ -27,15 +27,15 @@ footprint: [[0.15, 0.15], [-0.15, 0.15], [-0.15, -0.15], [0.15, -0.15]]
 LIDAR = "lidar: {beams: 360, rate_hz: 10, range_min: 0.12, range_max: 3.5}\n"
 
 
-def make(folder: Path, scan: str, lidar: str = LIDAR) -> Driver:
+def make_carrier(folder: Path, scan: str, lidar: str = LIDAR) -> Driver:
     path = folder / "robot.yaml"
     path.write_text(f"{BODY}{lidar}real:\n  driver: mock\n  scan: {scan}\n")
     return make_driver(str(path), Run(folder=folder, link="real"))[1]
 
 
-async def test_a_body_emits_the_scans_of_the_lidar_that_it_carries(tmp_path: Path) -> None:
+async def test_a_body_emits_the_scans_of_its_lidar(tmp_path: Path) -> None:
     port = str(tmp_path / "scan")
-    driver = make(tmp_path, f"{{driver: ld19, port: {port}}}")
+    driver = make_carrier(tmp_path, f"{{driver: ld19, port: {port}}}")
     scans: list[Message] = []
     driver.emit = lambda topic, message: scans.append(message) if topic is SCAN else None
     async with emulated(LdDevice, ScanOptions(driver="ld19", port=port)), driver:
@@ -47,15 +47,15 @@ async def test_a_body_emits_the_scans_of_the_lidar_that_it_carries(tmp_path: Pat
     assert agree(newest, truth()) > 0.97
 
 
-async def test_a_body_opens_and_closes_though_its_lidar_is_not_there(tmp_path: Path) -> None:
-    driver = make(tmp_path, f"{{driver: rplidar, port: {tmp_path}/none, model: c1}}")
+async def test_a_body_opens_and_closes_without_its_lidar(tmp_path: Path) -> None:
+    driver = make_carrier(tmp_path, f"{{driver: rplidar, port: {tmp_path}/none, model: c1}}")
     async with driver:
         assert await driver.get_sensor_data("scan") is None
     await driver.close()
 
 
-def test_the_options_of_a_lidar_are_those_of_its_own_kind(tmp_path: Path) -> None:
-    driver = make(tmp_path, "{driver: rplidar, port: /dev/ttyUSB0, model: s2}")
+def test_lidar_options_have_the_type_of_their_driver(tmp_path: Path) -> None:
+    driver = make_carrier(tmp_path, "{driver: rplidar, port: /dev/ttyUSB0, model: s2}")
 
     assert driver.options.scan == RplidarOptions(
         driver="rplidar", port="/dev/ttyUSB0", model="s2", scan_mode="auto"
@@ -63,7 +63,7 @@ def test_the_options_of_a_lidar_are_those_of_its_own_kind(tmp_path: Path) -> Non
 
 
 @pytest.mark.parametrize(
-    ("scan", "said"),
+    ("scan", "expected"),
     [
         ("{driver: rplidar, modell: c1}", "robot.yaml:10: .*modell"),
         ("{driver: rplidar, model: c2}", "robot.yaml:10: .*c2"),
@@ -72,25 +72,25 @@ def test_the_options_of_a_lidar_are_those_of_its_own_kind(tmp_path: Path) -> Non
         ("ld19", "robot.yaml:10: "),
     ],
 )
-def test_what_a_lidar_does_not_know_is_refused_with_its_line(
-    scan: str, said: str, tmp_path: Path
+def test_unknown_lidar_options_are_refused_with_their_line(
+    scan: str, expected: str, tmp_path: Path
 ) -> None:
-    with pytest.raises(ConfigError, match=said):
-        make(tmp_path, scan)
+    with pytest.raises(ConfigError, match=expected):
+        make_carrier(tmp_path, scan)
 
 
 def test_an_unknown_lidar_is_refused_with_the_nearest_known_one(tmp_path: Path) -> None:
     with pytest.raises(UnknownName, match="no lidar 'ld18'; did you mean 'ld19'"):
-        make(tmp_path, "{driver: ld18}")
+        make_carrier(tmp_path, "{driver: ld18}")
 
 
-async def test_a_lidar_on_a_body_that_does_not_describe_one_is_refused(tmp_path: Path) -> None:
-    driver = make(tmp_path, "{driver: ld19}", lidar="")
+async def test_a_scan_driver_without_a_lidar_description_is_refused(tmp_path: Path) -> None:
+    driver = make_carrier(tmp_path, "{driver: ld19}", lidar="")
 
     with pytest.raises(ConfigError, match="has `scan` on its link but no `lidar`"):
         await driver.open()
 
 
 @pytest.mark.parametrize("name", sorted(LIDARS))
-def test_every_lidar_that_is_listed_can_be_had(name: str) -> None:
+def test_every_listed_lidar_can_be_loaded(name: str) -> None:
     assert issubclass(source_class(name), ScanSource)

@@ -1,4 +1,4 @@
-"""The chaos proxy for TCP links: what it does to the bytes, and that it leaves nothing."""
+"""The chaos proxy for TCP links: its faults, and its cleanup."""
 
 import asyncio
 import functools
@@ -16,7 +16,7 @@ from gigabrain_zenoh.testing.processes import SampleCollector, repeat, robot
 from gigabrain_zenoh.testing.waiting import until
 from tests.system.server import Server, serving
 
-LONG = bytes(range(256)) * 400  # more than is read at once
+LONG = bytes(range(256)) * 400  # more than one read returns
 
 
 @pytest.fixture
@@ -35,7 +35,7 @@ async def call(proxy: TcpProxy) -> tuple[asyncio.StreamReader, asyncio.StreamWri
     return await asyncio.open_connection(*proxy.address)
 
 
-async def test_a_calm_proxy_changes_nothing_either_way(
+async def test_a_calm_proxy_changes_no_bytes_in_both_directions(
     server: tuple[Server, int], proxy: TcpProxy
 ) -> None:
     reader, writer = await call(proxy)
@@ -50,7 +50,7 @@ async def test_a_calm_proxy_changes_nothing_either_way(
     await until(lambda: proxy.open_calls == 0, "nothing open")
 
 
-async def test_who_has_said_all_may_still_listen(
+async def test_a_half_closed_connection_still_receives(
     server: tuple[Server, int], proxy: TcpProxy
 ) -> None:
     proxy.set(Chaos(delay_ms=50))
@@ -64,7 +64,7 @@ async def test_who_has_said_all_may_still_listen(
     writer.close()
 
 
-async def test_a_hole_takes_nothing_and_hands_all_on_when_it_ends(
+async def test_a_hole_delays_all_bytes_until_it_ends(
     server: tuple[Server, int], proxy: TcpProxy
 ) -> None:
     _, writer = await call(proxy)
@@ -72,7 +72,7 @@ async def test_a_hole_takes_nothing_and_hands_all_on_when_it_ends(
     await until(lambda: server[0].received, "before")
     proxy.set(Chaos(hole=True))
     writer.write(b" during")
-    _, second = await call(proxy)  # is taken, and hears nothing
+    _, second = await call(proxy)  # accepted, but gets no reply
     second.write(b" another")
     await asyncio.sleep(0.1)
     assert (bytes(server[0].received), len(server[0].writers)) == (b"before", 1)
@@ -83,7 +83,7 @@ async def test_a_hole_takes_nothing_and_hands_all_on_when_it_ends(
     second.close()
 
 
-async def test_a_hole_of_one_way_leaves_the_other(
+async def test_a_hole_in_one_direction_leaves_the_other_open(
     server: tuple[Server, int], proxy: TcpProxy
 ) -> None:
     reader, writer = await call(proxy)
@@ -99,7 +99,7 @@ async def test_a_hole_of_one_way_leaves_the_other(
     writer.close()
 
 
-async def test_a_hole_hides_that_somebody_has_left(
+async def test_a_hole_hides_a_closed_connection(
     server: tuple[Server, int], proxy: TcpProxy
 ) -> None:
     _, writer = await call(proxy)
@@ -114,7 +114,7 @@ async def test_a_hole_hides_that_somebody_has_left(
 
 
 @pytest.mark.parametrize(("reset", "end"), [(True, "rst"), (False, "fin")])
-async def test_a_cut_ends_both_sides_as_it_is_told(
+async def test_a_cut_ends_both_sides_with_reset_or_fin(
     server: tuple[Server, int], proxy: TcpProxy, reset: bool, end: str
 ) -> None:
     reader, writer = await call(proxy)
@@ -130,7 +130,7 @@ async def test_a_cut_ends_both_sides_as_it_is_told(
     writer.close()
 
 
-async def test_an_unplugged_proxy_refuses_callers_and_is_back_at_the_same_port(
+async def test_an_unplugged_proxy_refuses_callers_and_returns_at_the_same_port(
     server: tuple[Server, int], proxy: TcpProxy
 ) -> None:
     _, first = await call(proxy)
@@ -147,7 +147,7 @@ async def test_an_unplugged_proxy_refuses_callers_and_is_back_at_the_same_port(
     second.close()
 
 
-async def test_a_caller_is_reset_where_nobody_listens_behind(proxy: TcpProxy) -> None:
+async def test_a_caller_is_reset_if_the_server_is_down(proxy: TcpProxy) -> None:
     async with TcpProxy(("127.0.0.1", 1)) as leads_nowhere:
         reader, writer = await call(leads_nowhere)
         with pytest.raises(ConnectionResetError):
@@ -169,7 +169,7 @@ async def test_delay_and_jitter_keep_the_order(server: tuple[Server, int], proxy
     writer.close()
 
 
-async def test_a_receiver_who_does_not_read_makes_the_sender_wait(
+async def test_a_full_proxy_makes_the_sender_wait(
     server: tuple[Server, int], proxy: TcpProxy
 ) -> None:
     _, writer = await call(proxy)
@@ -190,7 +190,7 @@ async def test_a_receiver_who_does_not_read_makes_the_sender_wait(
     writer.transport.abort()
 
 
-async def test_nothing_is_left_of_a_proxy(server: tuple[Server, int]) -> None:
+async def test_a_closed_proxy_leaves_no_socket_or_task(server: tuple[Server, int]) -> None:
     before, tasks = len(os.listdir("/dev/fd")), len(asyncio.all_tasks())
     for chaos in (CALM, Chaos(hole=True), Chaos(delay_ms=1000)):
         async with TcpProxy(("127.0.0.1", server[1])) as proxy:
@@ -206,17 +206,17 @@ async def test_nothing_is_left_of_a_proxy(server: tuple[Server, int]) -> None:
 
 
 @pytest.mark.parametrize("fault", ["hole", "rst", "unplugged"])
-async def test_zenoh_goes_on_once_the_network_is_well_again(fault: str) -> None:
+async def test_zenoh_recovers_from_network_faults(fault: str) -> None:
     async with robot() as net:
         router = await net.router()
         host, _, port = net.endpoint.removeprefix("tcp/").rpartition(":")
         async with TcpProxy((host, int(port))) as proxy:
             client = await ZenohTransport.open(Endpoint(connect=(proxy.endpoint,)))
-            ear = SampleCollector(router, "robot/teleop")
-            say = functools.partial(client.publish, TELEOP, "robot/teleop")
-            await repeat(lambda: say(b"before", ""), lambda: ear.samples)
+            collector = SampleCollector(router, "robot/teleop")
+            publish = functools.partial(client.publish, TELEOP, "robot/teleop")
+            await repeat(lambda: publish(b"before", ""), lambda: collector.samples)
             calls = proxy.calls
-            if fault == "hole":  # longer than the lease: both ends give the link up
+            if fault == "hole":  # both ends drop the link after its lease
                 proxy.set(Chaos(hole=True))
                 await until(lambda: proxy.calls > calls, "Zenoh calls again")
                 proxy.set()
@@ -225,6 +225,6 @@ async def test_zenoh_goes_on_once_the_network_is_well_again(fault: str) -> None:
             else:
                 await proxy.unplug()
                 await proxy.plug()
-            await repeat(lambda: say(b"after", ""), lambda: b"after" in ear.payloads)
+            await repeat(lambda: publish(b"after", ""), lambda: b"after" in collector.payloads)
             assert proxy.calls > calls
             await client.close()

@@ -1,4 +1,4 @@
-"""The `gigabrain` command: help, names that are nearly right, and what it costs to ask."""
+"""The `gigabrain` command: help, misspelt names, and start-up cost."""
 
 import asyncio
 import json
@@ -17,12 +17,12 @@ from gigabrain_drivers.driver.catalog import robot_files
 from gigabrain_zenoh.cli.app import COMMANDS, PARENTS, make_app
 from gigabrain_zenoh.testing.processes import GIGABRAIN, Home, free_port
 
-# takes longer than all the rest of `gigabrain --help` together
+# importing any of these takes longer than all the rest of `gigabrain --help`
 HEAVY = {"numpy", "zenoh", "mujoco", "asyncio", "yaml", "rich.markdown", "importlib.metadata"}
 
 
 def words(app: App, prefix: str = "") -> Iterator[str]:
-    """Every command with its group."""
+    """Return every command with its group."""
     for name in app:
         if name.startswith("-"):
             continue
@@ -35,18 +35,18 @@ def test_the_table_of_commands_is_complete() -> None:
     assert sorted(words(make_app(tuple(PARENTS)))) == sorted(COMMANDS)
 
 
-def test_help_imports_nothing_that_takes_long() -> None:
-    told = subprocess.run(
+def test_help_imports_no_heavy_package() -> None:
+    done = subprocess.run(
         (sys.executable, "-X", "importtime", *GIGABRAIN[1:], "--help"),
         capture_output=True,
         text=True,
         check=True,
     )
-    imported = {line.rpartition("|")[2].strip() for line in told.stderr.splitlines()}
+    imported = {line.rpartition("|")[2].strip() for line in done.stderr.splitlines()}
     assert "cyclopts" in imported
     assert imported & HEAVY == set()
     for name in ("demo", "up", "driver", "estop", "robots", "worlds"):
-        assert re.search(rf"^│ {name} +[A-Z]", told.stdout, re.MULTILINE)
+        assert re.search(rf"^│ {name} +[A-Z]", done.stdout, re.MULTILINE)
 
 
 async def test_the_version_is_that_of_the_package(home: Home) -> None:
@@ -63,7 +63,7 @@ async def test_the_version_is_that_of_the_package(home: Home) -> None:
         ("up dmeo", "demo"),
     ],
 )
-async def test_what_is_mistyped_is_refused_in_one_line(
+async def test_mistyped_arguments_are_refused_in_one_line(
     home: Home, arguments: str, named: str
 ) -> None:
     command = await home.run(*arguments.split())
@@ -76,7 +76,7 @@ async def test_what_is_mistyped_is_refused_in_one_line(
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="by /dev/full")
 @pytest.mark.parametrize("unbuffered", ["", "1"])
 @pytest.mark.parametrize("words", ["robots", "--help", "demo --help", "completion bash"])
-def test_a_full_disk_under_the_output_is_said_in_one_line(words: str, unbuffered: str) -> None:
+def test_an_output_to_a_full_disk_fails_in_one_line(words: str, unbuffered: str) -> None:
     with Path("/dev/full").open("w") as full:
         command = subprocess.run(
             (*GIGABRAIN, *words.split()),

@@ -1,4 +1,4 @@
-"""`gigabrain_zenoh.connect()`: a script beside a robot that drives itself."""
+"""`gigabrain_zenoh.connect()`: scripts beside a robot that drives autonomously."""
 
 import asyncio
 import contextlib
@@ -37,7 +37,7 @@ def demo(shared_home: Home) -> CommandProcess:
 async def robot(
     shared_home: Home, demo: CommandProcess, monkeypatch: pytest.MonkeyPatch
 ) -> AsyncIterator[Probe]:
-    """The robot of the demo, driving itself; scripts find it without being told where it is."""
+    """The driving robot of the demo; scripts find it without an endpoint."""
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(shared_home.folder / "run"))
     async with probing(await robot_of(shared_home, demo)) as onlooker:
         await until(lambda: onlooker.state.gate.mode == "enabled", "driving")
@@ -51,15 +51,15 @@ async def square(script: Robot) -> None:
 
 
 @pytest.mark.slow
-async def test_a_script_drives_a_square_and_the_brain_goes_on_afterwards(robot: Probe) -> None:
+async def test_a_script_drives_a_square_and_then_the_brain_drives_on(robot: Probe) -> None:
     async with gigabrain_zenoh.connect(take=True, source="square") as script:
-        for _ in range(4):  # where a busy machine holds up the script or the gate, once more
+        for _ in range(4):  # repeat: a busy machine may delay script or gate
             try:
                 await script.set_base_velocity(0.0)
                 await robot.at_rest()
                 start = robot.state
                 await square(script)
-            except Refused:  # the machine held up safety, and the gate lets nobody in meanwhile
+            except Refused:  # refused while a busy machine delays safety
                 await robot.ticks(50)
                 continue
             moved = robot.distance_from(start)
@@ -74,7 +74,7 @@ async def test_a_script_drives_a_square_and_the_brain_goes_on_afterwards(robot: 
     await robot.driving_straight(speed=0.15, room=0.0)
 
 
-async def test_a_script_moves_and_turns_by_what_odometry_measures(robot: Probe) -> None:
+async def test_a_script_moves_and_turns_by_odometry(robot: Probe) -> None:
     async with connect(take=True, source="measured") as script:
         await script.set_base_velocity(0.0)
         await robot.at_rest()
@@ -88,7 +88,7 @@ async def test_a_script_moves_and_turns_by_what_odometry_measures(robot: Probe) 
         assert moved.distance == pytest.approx(-0.1, abs=0.03)
 
 
-async def test_a_script_without_asyncio_has_the_same_robot(robot: Probe) -> None:
+async def test_a_script_can_use_the_robot_without_asyncio(robot: Probe) -> None:
     def script() -> tuple[str, float, int]:
         with gigabrain_zenoh.connect(take=True, source="plain") as plain:
             plain.set_base_velocity(0.0)
@@ -102,9 +102,9 @@ async def test_a_script_without_asyncio_has_the_same_robot(robot: Probe) -> None
     await until(lambda: robot.state.gate.commander == "control", "the brain goes on")
 
 
-async def test_a_script_keeps_the_body_while_it_thinks(robot: Probe) -> None:
+async def test_a_script_keeps_the_body_between_its_commands(robot: Probe) -> None:
     kept = ""
-    for _ in range(4):  # where a busy machine holds up the script or the gate, once more
+    for _ in range(4):  # repeat: a busy machine may delay script or gate
         begin = robot.state.tick
         with contextlib.suppress(Refused):
             async with connect(take=True, source="thinker") as script:
@@ -122,7 +122,7 @@ async def test_a_script_keeps_the_body_while_it_thinks(robot: Probe) -> None:
     await until(lambda: robot.state.gate.commander == "control", "the brain goes on")
 
 
-async def test_without_take_it_is_refused_and_told_who_drives(robot: Probe) -> None:
+async def test_without_take_a_script_is_refused_with_the_present_commander(robot: Probe) -> None:
     async with connect() as script:
         with pytest.raises(Refused) as refused:
             await script.set_base_velocity(0.1)
@@ -133,7 +133,7 @@ async def test_without_take_it_is_refused_and_told_who_drives(robot: Probe) -> N
     assert robot.state.gate.commander == "control"
 
 
-async def test_a_script_gets_the_body_that_still_stops_for_the_last_one(robot: Probe) -> None:
+async def test_a_script_gets_a_body_that_still_stops_after_another_script(robot: Probe) -> None:
     async with connect(source="next") as after:
         async with connect(take=True, source="last") as last:
             await last.set_base_velocity(0.0, angular_z=1.0)
@@ -143,7 +143,7 @@ async def test_a_script_gets_the_body_that_still_stops_for_the_last_one(robot: P
     await until(lambda: robot.state.gate.commander == "control", "the brain goes on")
 
 
-async def test_a_script_that_was_taken_over_does_not_take_the_body_back(robot: Probe) -> None:
+async def test_a_script_does_not_retake_a_body_that_was_taken_over(robot: Probe) -> None:
     async with connect(take=True, source="script") as script, connect(source="person") as person:
         await script.set_base_velocity(0.1)
         await person.enable(take=True)
@@ -158,11 +158,11 @@ async def test_a_script_that_was_taken_over_does_not_take_the_body_back(robot: P
     await until(lambda: robot.state.gate.commander == "control", "the brain goes on")
 
 
-async def test_a_velocity_lasts_one_second_and_is_cut_to_what_the_body_can(
+async def test_a_velocity_lasts_one_second_and_is_limited_to_the_body(
     robot: Probe,
 ) -> None:
     async with connect(take=True) as script:
-        for _ in range(4):  # once more where a busy machine holds up the script or the gate
+        for _ in range(4):  # repeat: a busy machine may delay script or gate
             start = robot.state
             asked = await script.set_base_velocity(0.0, 0.5, -9.0)
             assert (asked.linear_x, asked.linear_y, asked.angular_z) == (0.0, 0.0, -1.82)
@@ -176,12 +176,12 @@ async def test_a_velocity_lasts_one_second_and_is_cut_to_what_the_body_can(
     await until(lambda: robot.state.gate.commander == "control", "the brain goes on")
 
 
-async def test_what_the_robot_says_can_be_listened_to(robot: Probe) -> None:
+async def test_a_script_can_subscribe_to_topics(robot: Probe) -> None:
     async with connect() as script:
         scans: list[LaserScan] = []
         async with asyncio.timeout(60):
             async for scan in script.topic("scan"):
-                scans.append(scan)  # whoever is held up gets the newest, and misses some
+                scans.append(scan)  # a delayed subscriber misses some scans
                 if [b.tick - a.tick for a, b in itertools.pairwise(scans[-3:])] == [5, 5]:
                     break
         assert {type(scan) for scan in scans} == {LaserScan}
@@ -195,7 +195,7 @@ async def test_what_the_robot_says_can_be_listened_to(robot: Probe) -> None:
         ]
 
 
-async def test_what_there_is_not_is_said_in_words(robot: Probe) -> None:
+async def test_unknown_names_are_refused_with_an_explanation(robot: Probe) -> None:
     async with connect() as script:
         with pytest.raises(UnknownName, match=r"no topic 'scna'; did you mean 'scan'\? known: "):
             script.topic("scna")
@@ -224,7 +224,7 @@ async def test_several_robots_are_listed(
 
 
 @pytest.mark.slow
-async def test_no_robot_no_router_and_no_driver_are_told_apart(
+async def test_errors_distinguish_no_robot_no_router_and_no_driver(
     tmp_path_factory: pytest.TempPathFactory, home: Home, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(home.folder / "run"))
@@ -245,7 +245,7 @@ async def test_no_robot_no_router_and_no_driver_are_told_apart(
             await script.estop()
 
 
-async def test_a_release_waits_until_the_body_has_rested(robot: Probe) -> None:
+async def test_a_release_waits_until_the_body_is_at_rest(robot: Probe) -> None:
     async with connect(take=True) as script:
         assert isinstance(script, Robot)
         await script.set_base_velocity(0.15, 0.0, 0.0)

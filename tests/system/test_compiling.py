@@ -1,4 +1,4 @@
-"""Compiling beforehand, in a process of its own."""
+"""Kernels are compiled in advance, in a child process."""
 
 import asyncio
 import os
@@ -21,7 +21,7 @@ from gigabrain_zenoh.perception.node import LOCALIZE_KERNELS, MAP_KERNELS
 from gigabrain_zenoh.plugins import find
 from tests.places import ROOT
 
-CALLS = """
+COUNTED_MODULE = """
 import os
 def warm_up():
     with open(os.environ["CALLS"], "a") as file:
@@ -33,8 +33,8 @@ WARM_UPS = (MAP_KERNELS, LOCALIZE_KERNELS, DRIVE_KERNELS, CAR_KERNELS, ARM_KERNE
 
 @pytest.fixture
 def calls(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The file that gets a line with the process's number whenever all is called."""
-    (tmp_path / "counted.py").write_text(CALLS)
+    """The file to which each call of `warm_up` appends its process's pid."""
+    (tmp_path / "counted.py").write_text(COUNTED_MODULE)
     monkeypatch.syspath_prepend(str(tmp_path))
     monkeypatch.setenv("CALLS", str(tmp_path / "calls"))
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "kept"))
@@ -42,37 +42,37 @@ def calls(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path / "calls"
 
 
-def who(calls: Path) -> list[bool]:
-    """For each call, whether it was this process's."""
+def calls_by_this_process(calls: Path) -> list[bool]:
+    """Return for each call whether this process made it."""
     return [int(line) == os.getpid() for line in calls.read_text().split()]
 
 
-async def test_the_first_start_compiles_in_a_process_of_its_own(calls: Path) -> None:
+async def test_the_first_start_compiles_in_a_child_process(calls: Path) -> None:
     await precompile.ensure_compiled(WARM_UP)
-    assert who(calls) == [False, True]
+    assert calls_by_this_process(calls) == [False, True]
     await precompile.ensure_compiled(WARM_UP)
-    assert who(calls) == [False, True, True]
+    assert calls_by_this_process(calls) == [False, True, True]
 
 
-async def test_after_a_change_of_any_kernel_it_does_so_again(
+async def test_after_a_change_of_any_kernel_a_child_compiles_again(
     calls: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     await precompile.ensure_compiled(WARM_UP)
     monkeypatch.setattr(kernels, "PACKAGE", tmp_path)
     await precompile.ensure_compiled(WARM_UP)
-    assert who(calls) == [False, True, False, True]
+    assert calls_by_this_process(calls) == [False, True, False, True]
 
 
-async def test_where_nothing_can_be_kept_it_compiles_here(
+async def test_without_a_cache_folder_this_process_compiles(
     calls: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "file").write_text("")
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "file" / "below"))
     await precompile.ensure_compiled(WARM_UP)
-    assert who(calls) == [True]
+    assert calls_by_this_process(calls) == [True]
 
 
-TINY = """
+TINY_MODULE = """
 from gigabrain_zenoh.kernels.jit import kernel
 @kernel
 def double(x: int) -> int:
@@ -80,13 +80,13 @@ def double(x: int) -> int:
 def warm_up() -> None:
     assert double(21) == 42
 """
-FULL = """
+ON_FULL_DISK = """
 import asyncio, errno, os
 from gigabrain_zenoh.kernels import jit, precompile
 from numba.core.caching import IndexDataCacheFile
 def full(*_):
     raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-IndexDataCacheFile._save_data = full  # there is room for the mark, which is smaller
+IndexDataCacheFile._save_data = full  # the smaller mark still fits
 async def in_child(*_):
     return 1
 precompile.compile_in_child = in_child
@@ -97,18 +97,18 @@ print(precompile.is_kept("tiny:warm_up"))
 """
 
 
-def test_on_a_full_disk_kernels_run_and_do_not_count_as_kept(
+def test_on_a_full_disk_kernels_run_but_do_not_count_as_cached(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    (tmp_path / "tiny.py").write_text(TINY)
+    (tmp_path / "tiny.py").write_text(TINY_MODULE)
     places = (str(tmp_path), str(ROOT), os.environ.get("PYTHONPATH", ""))
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join(places))
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "kept"))
-    done = subprocess.run((sys.executable, "-c", FULL), capture_output=True, text=True)
+    done = subprocess.run((sys.executable, "-c", ON_FULL_DISK), capture_output=True, text=True)
     assert (done.returncode, done.stdout) == (0, "False\nFalse\n"), done.stderr
 
 
-async def test_precompile_does_not_claim_what_was_not_kept(
+async def test_precompile_fails_if_the_kernels_cannot_be_cached(
     calls: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "file").write_text("")
@@ -120,7 +120,7 @@ async def test_precompile_does_not_claim_what_was_not_kept(
         await map_commands._compile("mapping", WARM_UP, links=True)
 
 
-def test_what_was_compiled_beforehand_is_not_compiled_at_the_start(calls: Path) -> None:
+def test_precompiling_leaves_a_mark_for_the_next_start(calls: Path) -> None:
     mark = kernels.mark_of(WARM_UP)
     assert mark
     assert not mark.exists()
@@ -129,12 +129,12 @@ def test_what_was_compiled_beforehand_is_not_compiled_at_the_start(calls: Path) 
 
 
 @pytest.mark.parametrize("warm_up", WARM_UPS)
-def test_what_is_to_be_called_is_there(warm_up: str) -> None:
+def test_every_warm_up_function_exists(warm_up: str) -> None:
     assert isinstance(find(warm_up), types.FunctionType)
 
 
 @pytest.mark.parametrize("code", [0, 1])
-def test_what_is_compiled_beforehand_is_what_each_process_calls(
+def test_precompile_compiles_the_kernels_of_each_process(
     code: int, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     tried, done = list[str](), list[str]()
@@ -149,13 +149,13 @@ def test_what_is_compiled_beforehand_is_what_each_process_calls(
     monkeypatch.setattr(precompile, "can_link", lambda: False)
     map_commands.precompile()
     assert sorted(tried) == sorted(WARM_UPS)
-    assert done == (tried if code else [])  # what a child cannot do
+    assert done == (tried if code else [])  # this process does what the child could not
     out = capsys.readouterr().out
     assert out.count(" s\n") == 2
     assert map_commands.NOT_LINKED in out
 
 
-async def test_precompile_links_what_each_process_calls(
+async def test_precompile_links_the_kernels_of_each_process(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     linked = dict[str, tuple[str, ...]]()
@@ -177,13 +177,13 @@ async def test_precompile_links_what_each_process_calls(
     assert "not linked" not in capsys.readouterr().out
 
 
-def test_a_child_that_fails_says_so(calls: Path) -> None:
+def test_a_failing_child_has_a_nonzero_exit_code(calls: Path) -> None:
     assert asyncio.run(precompile.compile_in_child(WARM_UP)) == 0
-    assert who(calls) == [False]
+    assert calls_by_this_process(calls) == [False]
     assert asyncio.run(precompile.compile_in_child("counted:nothing")) == 1
 
 
-ALONE = """
+IMPORTS_BY_NUMBA = """
 import importlib, sys
 from gigabrain_zenoh.kernels import jit as kernels
 @kernels.kernel
@@ -196,15 +196,15 @@ for name in sys.argv[1:]:
 """
 
 
-def test_numba_imports_nothing_that_we_do_not_use_and_hides_nothing_for_good() -> None:
-    there = [name for name in jit.UNUSED if find_spec(name.partition(".")[0])]
-    assert "coverage" in there
-    command = (sys.executable, "-c", ALONE, *there)
+def test_numba_imports_no_unused_package_and_these_stay_importable() -> None:
+    installed = [name for name in jit.UNUSED if find_spec(name.partition(".")[0])]
+    assert "coverage" in installed
+    command = (sys.executable, "-c", IMPORTS_BY_NUMBA, *installed)
     done = subprocess.run(command, capture_output=True, text=True)
     assert (done.returncode, done.stdout) == (0, "\n"), done.stderr
 
 
-FINDING = """
+LOCALIZE_ONLY = """
 import sys
 import gigabrain_zenoh.perception.mapper
 from gigabrain_zenoh.mapping.static_map import warm_up
@@ -213,8 +213,8 @@ print("gtsam" in sys.modules)
 """
 
 
-def test_who_finds_its_way_in_a_saved_map_does_not_pay_for_making_one() -> None:
-    done = subprocess.run((sys.executable, "-c", FINDING), capture_output=True, text=True)
+def test_localizing_in_a_saved_map_does_not_import_gtsam() -> None:
+    done = subprocess.run((sys.executable, "-c", LOCALIZE_ONLY), capture_output=True, text=True)
     assert done.stdout == "False\n", done.stderr
 
 
@@ -228,10 +228,14 @@ def test_the_child_imports_nothing_from_the_current_folder(
     monkeypatch.chdir(here)
     assert asyncio.run(precompile.compile_in_child(WARM_UP)) == 0
     assert not (here / "was_run").exists()
-    assert who(calls) == [False]
+    assert calls_by_this_process(calls) == [False]
 
 
-def test_why_the_child_failed_is_in_the_log(calls: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_the_error_of_a_failing_child_is_logged(
+    calls: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     assert asyncio.run(precompile.compile_in_child("counted:nothing")) == 1
-    (said,) = (record.getMessage() for record in caplog.records if "compil" in record.getMessage())
-    assert said.endswith("AttributeError: module 'counted' has no attribute 'nothing'")
+    (logged,) = (
+        record.getMessage() for record in caplog.records if "compil" in record.getMessage()
+    )
+    assert logged.endswith("AttributeError: module 'counted' has no attribute 'nothing'")

@@ -14,7 +14,7 @@ from gigabrain_zenoh.qa.conformance.driver_checks import CheckedRobot
 from gigabrain_zenoh.qa.conformance.gate_checks import driver_killed
 from gigabrain_zenoh.qa.judging import Failed
 
-QUICK = ("mock", "mycustombot", "so101")  # the others in `make qa`
+QUICK = ("mock", "mycustombot", "so101")  # other robots only in `make qa`
 BODIES = [
     pytest.param(name, marks=() if name in QUICK else pytest.mark.qa) for name in robot_files()
 ]
@@ -29,14 +29,14 @@ NEEDS_A_PEER = {
 
 @pytest.mark.parametrize("name", BODIES)
 @pytest.mark.slow
-async def test_every_robot_passes_the_kit(
+async def test_every_robot_passes_the_conformance_kit(
     name: str, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     links = [link for link in robot_links(load_robot(name)) if link != "real"]
-    checked = [  # not at once: a simulation in lock-step takes the time that an emulator needs
+    checked = [  # one at a time: a simulation in lock-step would slow down an emulator
         await kit.check(name, link, tmp_path / link, lambda result: None) for link in links
     ]
-    assert "dropped a message" not in caplog.text  # the kit's own are not said
+    assert "dropped a message" not in caplog.text  # the kit's invalid messages are not logged
     for link, results in zip(links, checked, strict=True):
         assert [result for result in results if result.verdict == "FAILED"] == []
         robot = load_robot(name)
@@ -55,19 +55,19 @@ async def test_wheels_without_a_watchdog_are_stopped_when_their_driver_is_killed
 ) -> None:
     async with CheckedRobot("lekiwi", "emulated", tmp_path) as robot:
         assert robot.goes_on
-        await driver_killed(robot)  # raises Failed if they turn on
+        await driver_killed(robot)  # raises Failed if the wheels keep turning
 
 
 async def test_a_driver_that_does_not_start_fails_at_once_with_its_exit_code(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(gate_checks, "__name__", "no_such_module")  # which the child runs
+    monkeypatch.setattr(gate_checks, "__name__", "no_such_module")  # the child runs this module
     async with CheckedRobot("mycustombot", "emulated", tmp_path) as robot:
         with pytest.raises(Failed, match="the driver ended with exit code 1 before it drove"):
             await driver_killed(robot)
 
 
-async def test_a_commander_that_has_ended_by_itself_need_not_be_killed(
+async def test_a_commander_that_already_ended_is_not_killed(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(gate_checks, "COMMANDER", "")

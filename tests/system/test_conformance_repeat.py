@@ -1,4 +1,4 @@
-"""A stop that is tried many times is judged by its worst, and told with its median."""
+"""Repeated stop tests are judged by their worst time, and reported with the median."""
 
 from pathlib import Path
 
@@ -26,7 +26,7 @@ def test_one_failure_among_many_is_counted_and_named() -> None:
     )
 
 
-def test_a_single_try_says_what_it_measured() -> None:
+def test_a_single_try_reports_its_measurement() -> None:
     assert summary([Finding(True, "at rest after 3 ticks", {"at rest": 60.0})]) == (
         "at rest after 3 ticks"
     )
@@ -34,14 +34,14 @@ def test_a_single_try_says_what_it_measured() -> None:
 
 @pytest.mark.slow
 async def test_only_the_stops_are_repeated(tmp_path: Path) -> None:
-    told: list[str] = []
-    results = await kit.check("mock", "sim", tmp_path, told.append, repeat=2)
+    messages: list[str] = []
+    results = await kit.check("mock", "sim", tmp_path, messages.append, repeat=2)
     assert [result for result in results if result.verdict == "FAILED"] == []
-    assert [text for text in told if "2 of 2" in text] == [
+    assert [text for text in messages if "2 of 2" in text] == [
         "stops on silence, 2 of 2",
         "stops on SIGKILL, 2 of 2",
     ]
-    assert told.count("opens") == 1
+    assert messages.count("opens") == 1
     silent = next(result for result in results if result.check == "stops on silence")
     assert silent.measured.startswith("worst of 2: at rest after ")
 
@@ -54,7 +54,7 @@ async def test_only_the_stops_are_repeated(tmp_path: Path) -> None:
         ("alpha", "100 ms (firmware_alpha.md)"),
     ],
 )
-async def test_a_body_is_judged_by_what_its_firmware_promises(
+async def test_a_body_is_judged_by_the_timeout_of_its_firmware(
     name: str, promise: str, tmp_path: Path
 ) -> None:
     async with CheckedRobot(name, "emulated", tmp_path) as subject:

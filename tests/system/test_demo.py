@@ -46,7 +46,7 @@ FIELDS = {
 
 
 async def run(home: Home, *options: str) -> tuple[CommandProcess, dict[str, Any]]:
-    """A demo with `options` to its end, and its report."""
+    """Run a demo with `options` to its end; return it and its report."""
     path = home.folder / f"report-{len(list(home.folder.iterdir()))}.json"
     demo = await home.run(*AVOID, "--headless", "--report", str(path), *options)
     assert path.exists(), demo.err
@@ -61,7 +61,7 @@ async def run(home: Home, *options: str) -> tuple[CommandProcess, dict[str, Any]
         (("safety: late", "decision: late"), "decision: late"),
     ],
 )
-def test_the_reported_fault_is_the_drivers_newest_or_the_newest(
+def test_the_reported_fault_is_the_newest_of_the_driver_or_else_of_any_process(
     texts: tuple[str, ...], newest: str
 ) -> None:
     assert newest_fault(texts) == newest
@@ -105,8 +105,8 @@ async def test_the_same_seed_gives_the_same_decisions_at_any_speed(home: Home) -
 
 
 @pytest.mark.slow
-async def test_a_robot_that_touches_something_fails_the_run(home: Home) -> None:
-    """Its file says that its lidar looks backwards, so it sees no wall ahead."""
+async def test_a_contact_fails_the_run(home: Home) -> None:
+    """The robot file turns the lidar backwards, so the robot sees no wall ahead."""
     waffle = BODIES / "turtlebot3_waffle"
     text = (waffle / "robot.yaml").read_text()
     text = text.replace("x: -0.064}", "x: -0.064, yaw: 3.14159}")
@@ -128,7 +128,7 @@ async def test_a_robot_that_does_not_move_fails_the_run(home: Home) -> None:
     assert report["verdict"] == "no motion"
 
 
-async def test_a_process_that_dies_fails_the_run_but_does_not_end_it(home: Home) -> None:
+async def test_a_dying_process_fails_the_run_but_does_not_end_it(home: Home) -> None:
     report = home.folder / "report.json"
     options = ("--seconds", "16", "--speed", "4", "--headless", "--report", str(report))
     demo = home.start(*AVOID, *options)
@@ -136,12 +136,12 @@ async def test_a_process_that_dies_fails_the_run_but_does_not_end_it(home: Home)
         await until(lambda: robot.state.gate.mode == "enabled", "driving")
         os.kill(await robot.pid("perception"), signal.SIGKILL)
     assert await demo.ended() == 1
-    told = json.loads(report.read_bytes())
-    assert (told["verdict"], told["restarts"]) == ("1 process died", 1)
-    assert (told["sim_seconds"], told["contacts"]) == (16.0, 0)
+    results = json.loads(report.read_bytes())
+    assert (results["verdict"], results["restarts"]) == ("1 process died", 1)
+    assert (results["sim_seconds"], results["contacts"]) == (16.0, 0)
 
 
-async def test_a_body_without_a_truth_of_its_own_is_judged_by_its_odometry(home: Home) -> None:
+async def test_a_body_without_simulation_is_judged_by_its_odometry(home: Home) -> None:
     demo, report = await run(home, "--body", "mock", "--seconds", "4", "--speed", "4")
     assert await demo.ended() == 0
     assert (report["contacts"], report["min_clearance_m"]) == (None, None)
@@ -153,7 +153,7 @@ async def test_a_body_without_a_truth_of_its_own_is_judged_by_its_odometry(home:
     "frozen",
     ["none", "driver", pytest.param("router", marks=IN_QA), pytest.param("decision", marks=IN_QA)],
 )
-async def test_ctrl_c_ends_all_of_it_also_when_one_hangs(home: Home, frozen: str) -> None:
+async def test_ctrl_c_ends_all_processes_even_if_one_hangs(home: Home, frozen: str) -> None:
     demo = home.start(*AVOID, "--headless")
     async with probing(await robot_of(home, demo)) as robot:
         await until(lambda: robot.state.gate.mode == "enabled", "driving")
@@ -166,7 +166,7 @@ async def test_ctrl_c_ends_all_of_it_also_when_one_hangs(home: Home, frozen: str
     assert list((home.folder / "run" / "gigabrain").iterdir()) == []
 
 
-async def test_a_driver_that_hangs_at_the_end_costs_its_truth_and_not_the_report(
+async def test_with_a_driver_that_hangs_at_the_end_there_is_still_a_report(
     home: Home,
 ) -> None:
     path = home.folder / "report.json"
@@ -177,13 +177,13 @@ async def test_a_driver_that_hangs_at_the_end_costs_its_truth_and_not_the_report
         os.kill(await robot.pid("driver"), signal.SIGSTOP)
         demo.send(signal.SIGINT)
         assert await demo.ended() == 0
-    told = json.loads(path.read_bytes())
-    assert told["verdict"].endswith("the driver did not answer at the end")
-    assert (told["contacts"], told["stale_commands_executed"]) == (None, 0)
+    results = json.loads(path.read_bytes())
+    assert results["verdict"].endswith("the driver did not answer at the end")
+    assert (results["contacts"], results["stale_commands_executed"]) == (None, 0)
     assert "the driver did not answer at the end: " in demo.out
 
 
-async def test_two_demos_side_by_side_do_not_meet(home: Home) -> None:
+async def test_two_demos_at_once_do_not_connect_to_each_other(home: Home) -> None:
     demos = [home.start(*AVOID, "--headless", "--seed", seed) for seed in ("1", "2")]
     boots = []
     for demo in demos:
@@ -197,8 +197,8 @@ async def test_two_demos_side_by_side_do_not_meet(home: Home) -> None:
     assert [await demo.ended() for demo in demos] == [0, 0]
 
 
-def test_a_run_is_judged_by_contacts_motion_and_deaths() -> None:
-    told = {
+def test_the_verdict_depends_on_contacts_motion_and_deaths() -> None:
+    truth = {
         "body": "waffle", "distance_m": 0.049, "contacts": 2, "min_clearance_m": 0.0,
         "sim_seconds": 9.0, "stale_commands_executed": 0, "scan_to_cmd_p50_ms": 1.25,
         "scan_to_cmd_p99_ms": None, "lockstep_timeouts": 0,
@@ -208,7 +208,7 @@ def test_a_run_is_judged_by_contacts_motion_and_deaths() -> None:
         decisions=((1.0, "turning left: obstacle"), (2.0, "forward 0.20 m/s")), turns=1, deaths=1,
         restarts=1, rejected=3,
     )  # fmt: skip
-    report = make_report(told, seen)
+    report = make_report(truth, seen)
     assert not report.ok
     assert summary(report) == (
         "2 contacts, no motion, 1 process died: 0.05 m in 9 s, 1 turn, 2 contacts, "
@@ -217,8 +217,8 @@ def test_a_run_is_judged_by_contacts_motion_and_deaths() -> None:
     assert (report.rejected_messages, report.turns, report.sim_seconds) == (3, 1, 9.0)
 
 
-def test_of_a_robot_that_maps_the_area_and_its_tasks_are_reported_instead_of_turns() -> None:
-    told = {
+def test_a_mapping_robot_reports_area_and_tasks_instead_of_turns() -> None:
+    truth = {
         "distance_m": 4.0, "contacts": 0, "min_clearance_m": 0.4, "stale_commands_executed": 0,
         "scan_to_cmd_p50_ms": 20.0, "scan_to_cmd_p99_ms": 30.0, "lockstep_timeouts": 0,
     }  # fmt: skip
@@ -229,17 +229,17 @@ def test_of_a_robot_that_maps_the_area_and_its_tasks_are_reported_instead_of_tur
         decisions=((1.0, "exploring: going"),), turns=0, deaths=0, restarts=0, rejected=0,
         mapped_m2=33.61, tasks=status,
     )  # fmt: skip
-    report = make_report(told, seen)
+    report = make_report(truth, seen)
     assert (report.mapped_m2, report.tasks_done) == (33.6, 1)
     problem = "states come from the future"
     assert report.ok
-    assert not make_report(told, replace(seen, problem=problem)).ok
-    assert summary(make_report(told, replace(seen, problem=problem))).startswith(problem)
+    assert not make_report(truth, replace(seen, problem=problem)).ok
+    assert summary(make_report(truth, replace(seen, problem=problem))).startswith(problem)
     assert summary(report).startswith("ok: 4.00 m in 20 s, 34 m² mapped, 1 task done, 0 contacts")
-    assert ", 34 m² mapped, 0 contacts" in summary(make_report(told, replace(seen, tasks=None)))
+    assert ", 34 m² mapped, 0 contacts" in summary(make_report(truth, replace(seen, tasks=None)))
 
 
-def test_a_run_whose_driver_did_not_answer_in_the_end_is_reported_as_far_as_it_is_known() -> None:
+def test_without_a_reply_of_the_driver_the_report_uses_its_last_health() -> None:
     figures = {"scan_to_cmd_p50": 30.0, "scan_to_cmd_p99": 148.0}
     health = replace(DRIVER_HEALTH, latency_ms=figures, counters={"others": 3})
     seen = Observed(
@@ -258,7 +258,7 @@ def test_a_run_whose_driver_did_not_answer_in_the_end_is_reported_as_far_as_it_i
     assert (unknown.stale_commands_executed, unknown.lockstep_timeouts) == (None, None)
 
 
-async def test_the_mapped_area_is_that_of_cells_known_to_be_free_or_taken() -> None:
+async def test_the_mapped_area_counts_free_and_occupied_cells() -> None:
     net = Net()
     watch = RunMonitor(net.one)
     assert watch.mapped_m2 is None
@@ -269,14 +269,14 @@ async def test_the_mapped_area_is_that_of_cells_known_to_be_free_or_taken() -> N
     assert watch.mapped_m2 == pytest.approx(1.0)
 
 
-async def test_a_process_on_its_way_is_named_until_the_gate_is_open() -> None:
+async def test_a_starting_process_is_shown_until_the_gate_is_enabled() -> None:
     watch = RunMonitor(Net().one)
     assert doing(watch) == "starting"
     late = "decision is starting up, compiling, once per installation"
     assert doing(watch, late) == late
 
 
-async def test_a_report_that_cannot_be_written_is_refused_before_anything_starts(
+async def test_an_unwritable_report_path_is_refused_before_the_start(
     home: Home,
 ) -> None:
     nowhere = Path("nowhere") / "report.json"
@@ -286,10 +286,10 @@ async def test_a_report_that_cannot_be_written_is_refused_before_anything_starts
     assert not (home.folder / "state").exists()
 
 
-async def test_a_clock_that_stands_still_ends_the_demo_but_not_while_a_process_is_on_its_way(
+async def test_a_stopped_clock_ends_the_demo_unless_a_process_is_starting(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The very first start compiles, which may take minutes on a busy machine."""
+    """The first start compiles, which may take minutes on a busy machine."""
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
     monkeypatch.setattr(demo_module, "STALL_TIMEOUT_S", 1.0)
     net, stop = Net(), asyncio.Event()
@@ -308,7 +308,7 @@ async def test_a_clock_that_stands_still_ends_the_demo_but_not_while_a_process_i
     await net.two.close()
 
 
-async def test_where_the_page_is_is_said_once_and_not_before_it_is_there(
+async def test_the_address_of_the_page_is_shown_once_when_it_is_served(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
@@ -320,23 +320,23 @@ async def test_where_the_page_is_is_said_once_and_not_before_it_is_there(
     where = DemoOptions(headless=True, page="http://127.0.0.1:8080")
     demo = Demo(Deployment(router="tcp/127.0.0.1:0", hosts=hosts), where)
     view, page = demo._view(watch), demo._supervisor.statuses["page"]
-    said = []
+    counts = []
     for page.state in ("starting", "ready", "ready"):
         with view:
             view.show()
-        said.append(capfd.readouterr().err.count("operator page: http://127.0.0.1:8080\n"))
-    assert said == [0, 1, 0]
+        counts.append(capfd.readouterr().err.count("operator page: http://127.0.0.1:8080\n"))
+    assert counts == [0, 1, 0]
     await net.one.close()
     await net.two.close()
 
 
-def test_a_model_that_contradicts_the_robots_file_is_said_once_at_the_end(
+def test_a_contradicting_model_is_reported_once_at_the_end(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
     demo = Demo(Deployment(router="tcp/127.0.0.1:0"), DemoOptions(headless=True))
     record = {"process": "driver", "level": "warning", "event": "mismatch", "text": "a.xml: 1 m"}
     demo._record("driver", record)
-    demo._record("driver", record)  # of a driver that was started again
+    demo._record("driver", record)  # the same after a restart of the driver
     demo._finish(None, "", stopped=True)
     assert capfd.readouterr().err.count("warning: a.xml: 1 m\n") == 1

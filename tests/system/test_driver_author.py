@@ -1,4 +1,4 @@
-"""Packages of `gigabrain driver new`: they pass the kit as written, and fail with a mistake."""
+"""Packages of `gigabrain driver new`: they pass the kit unchanged, and fail with a mistake."""
 
 import runpy
 import tomllib
@@ -15,7 +15,7 @@ from gigabrain_zenoh.qa.conformance.driver_checks import CheckedRobot
 from gigabrain_zenoh.qa.judging import DriverCheckResult
 
 
-def installed(folder: Path, site: Path) -> Path:
+def install(folder: Path, site: Path) -> Path:
     """Move a package into `site` and write its metadata, as pip does; return its new folder."""
     project = tomllib.loads((folder / "pyproject.toml").read_text())["project"]
     lines = [
@@ -33,10 +33,10 @@ def installed(folder: Path, site: Path) -> Path:
 
 
 @pytest.mark.slow
-async def test_a_new_driver_passes_the_kit_by_its_name(tmp_path: Path, site: Path) -> None:
+async def test_a_new_driver_passes_the_conformance_kit(tmp_path: Path, site: Path) -> None:
     folder = authoring.write_package("kit_probe", tmp_path)
     assert folder == tmp_path / "gigabrain-kit-probe"
-    package = installed(folder, site)
+    package = install(folder, site)
     assert catalog.robot_files()["kit_probe"] == package / "robot.yaml"
     results = await kit.check("kit_probe", "sim", tmp_path / "kit", lambda result: None)
     assert [result for result in results if result.verdict == "FAILED"] == []
@@ -58,16 +58,16 @@ def test_a_driver_that_cannot_be_imported_is_refused_in_one_line(
     tmp_path: Path, site: Path
 ) -> None:
     with pytest.raises(ConfigError, match=r"driver 'kit_import' of .*No module named 'nowhere'"):
-        broken(
+        driver_with_mistake(
             "kit_import", tmp_path, site, "from gigabrain_drivers.driver.base", "from nowhere.base"
         )
 
 
-def test_what_the_docs_name_can_be_imported() -> None:
+def test_all_names_in_the_docs_can_be_imported() -> None:
     assert {"Link", "SerialLink", "TcpLink"} <= set(vars(links))
 
 
-def test_nothing_is_overwritten(tmp_path: Path) -> None:
+def test_existing_files_are_not_overwritten(tmp_path: Path) -> None:
     folder = authoring.write_package("kit_twice", tmp_path)
     (folder / "README.md").write_text("mine")
     with pytest.raises(ConfigError, match="exists; nothing was written"):
@@ -76,50 +76,50 @@ def test_nothing_is_overwritten(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["My Robot", "class", "1st", "a", "../x", "robot_", "a" * 65])
-def test_a_name_that_no_module_can_have_is_refused(name: str, tmp_path: Path) -> None:
+def test_an_invalid_module_name_is_refused(name: str, tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="expected lower-case letters"):
         authoring.write_package(name, tmp_path)
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_package_of_the_name_of_this_one_is_refused(tmp_path: Path) -> None:
+def test_the_name_of_this_package_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="gigabrain-zenoh is this one"):
         authoring.write_package("zenoh", tmp_path)
     assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize("name", ["mock", "turtlebot3_waffle", "line"])
-def test_a_name_that_is_taken_is_refused(name: str, tmp_path: Path) -> None:
+def test_the_name_of_a_known_driver_is_refused(name: str, tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="already"):
         authoring.write_package(name, tmp_path)
 
 
-def broken(name: str, folder: Path, site: Path, old: str, by: str) -> CheckedRobot:
-    """A new driver with one mistake in it."""
-    path = installed(authoring.write_package(name, folder), site) / "driver.py"
+def driver_with_mistake(name: str, folder: Path, site: Path, old: str, by: str) -> CheckedRobot:
+    """Return a new driver with one mistake."""
+    path = install(authoring.write_package(name, folder), site) / "driver.py"
     text = path.read_text()
     assert old in text
     path.write_text(text.replace(old, by))
     return CheckedRobot(name, "sim", folder)
 
 
-async def test_a_driver_that_ignores_its_limits_fails(tmp_path: Path, site: Path) -> None:
+async def test_a_driver_that_exceeds_its_speed_limit_fails(tmp_path: Path, site: Path) -> None:
     plain = "Velocity(linear_x=linear_x, linear_y=linear_y, angular_z=angular_z)"
     bounded = "self.bounded(linear_x, linear_y, angular_z)"
-    async with broken("kit_fast", tmp_path, site, bounded, plain) as subject:
+    async with driver_with_mistake("kit_fast", tmp_path, site, bounded, plain) as subject:
         found = await driver_checks.limits(subject)
         assert (found.ok, found.measured) == (False, "at most 10.00 of max speed")
         assert not (await driver_checks.refuses_nan(subject)).ok
 
 
-async def test_a_driver_that_ignores_its_limit_sideways_fails(tmp_path: Path, site: Path) -> None:
+async def test_a_driver_that_exceeds_its_lateral_limit_fails(tmp_path: Path, site: Path) -> None:
     bounded = "self._velocity = self.bounded(linear_x, linear_y, angular_z)"
     plain = (
         "self._velocity = self.bounded(linear_x, 0.0, angular_z)\n"
         "        self._velocity = Velocity(linear_x=self._velocity.linear_x, linear_y=linear_y,\n"
         "                                  angular_z=self._velocity.angular_z)"
     )
-    broken("kit_aside", tmp_path, site, bounded, plain)
+    driver_with_mistake("kit_aside", tmp_path, site, bounded, plain)
     file = site / "kit_aside_driver/robot.yaml"
     omni = "drive_type: omni\nmax_lateral_speed: 0.2"
     file.write_text(file.read_text().replace("drive_type: differential", omni))
@@ -129,34 +129,36 @@ async def test_a_driver_that_ignores_its_limit_sideways_fails(tmp_path: Path, si
 
 
 @pytest.mark.parametrize("axis", ["linear_x", "linear_y", "angular_z"])
-async def test_a_driver_that_goes_on_with_nan_in_one_axis_fails(
+async def test_a_driver_that_drives_on_with_nan_in_one_axis_fails(
     axis: str, tmp_path: Path, site: Path
 ) -> None:
     call = "self.bounded(linear_x, linear_y, angular_z)"
     lenient = call.replace(axis, f"{axis} if math.isfinite({axis}) else 0.0")
-    async with broken(f"kit_nan_{axis}", tmp_path, site, call, lenient) as subject:
+    async with driver_with_mistake(f"kit_nan_{axis}", tmp_path, site, call, lenient) as subject:
         assert not (await driver_checks.refuses_nan(subject)).ok
 
 
 async def test_a_driver_whose_stop_raises_fails(tmp_path: Path, site: Path) -> None:
     stop = '"""Bring the body to rest."""'
-    async with broken("kit_loud", tmp_path, site, stop, 'raise OSError("gone")') as subject:
+    async with driver_with_mistake(
+        "kit_loud", tmp_path, site, stop, 'raise OSError("gone")'
+    ) as subject:
         found = await driver_checks.never_raises(subject)
         assert (found.ok, found.measured) == (False, "stop, never opened: OSError('gone')")
 
 
-async def test_a_driver_that_returns_what_it_did_not_send_fails(tmp_path: Path, site: Path) -> None:
+async def test_a_driver_that_returns_another_velocity_than_it_sent_fails(
+    tmp_path: Path, site: Path
+) -> None:
     honest = "return self._velocity\n"
     lying = "return self.bounded(linear_x / 2, linear_y, angular_z)\n"
-    async with broken("kit_lies", tmp_path, site, honest, lying) as subject:
+    async with driver_with_mistake("kit_lies", tmp_path, site, honest, lying) as subject:
         assert not (await driver_checks.returns(subject)).ok
 
 
-async def test_a_driver_that_raises_something_else_fails_and_the_kit_goes_on(
-    tmp_path: Path, site: Path
-) -> None:
+async def test_after_an_unexpected_exception_the_kit_continues(tmp_path: Path, site: Path) -> None:
     reads = '"""Return the measurements of the body."""'
-    subject = broken("kit_bad", tmp_path, site, reads, "raise KeyError('battery')")
+    subject = driver_with_mistake("kit_bad", tmp_path, site, reads, "raise KeyError('battery')")
     async with subject:
         results = await kit.run(subject, lambda result: None)
     verdicts = {result.check: result for result in results}

@@ -1,4 +1,4 @@
-"""`--link emulated`: the real driver, the emulator beside it, and one brain that knows neither."""
+"""`--link emulated`: the real driver beside the emulator, with an unchanged brain."""
 
 import json
 from pathlib import Path
@@ -21,7 +21,7 @@ def specs(tmp_path: Path, link: str) -> dict[str, tuple[tuple[str, ...], Process
     }
 
 
-def test_the_emulator_is_started_before_the_driver_and_told_the_same_folder(
+def test_the_emulator_starts_before_the_driver_with_the_same_folder(
     tmp_path: Path,
 ) -> None:
     found = specs(tmp_path, "emulated")
@@ -41,9 +41,9 @@ def test_other_links_have_no_emulator(tmp_path: Path, link: str) -> None:
 
 
 @pytest.mark.slow
-async def test_a_robot_roams_by_bytes_on_two_serial_lines(home: Home) -> None:
+async def test_a_robot_roams_over_two_emulated_serial_lines(home: Home) -> None:
     path = home.folder / "report.json"
-    for seconds in ("8", "30", "60"):  # longer where a busy machine stops it again and again
+    for seconds in ("8", "30", "60"):  # repeat longer: a busy machine may stop it
         demo = await home.run(
             *AVOID, "--body", "mycustombot", "--link", "emulated", "--seconds", seconds,
             "--headless", "--report", str(path),
@@ -57,7 +57,7 @@ async def test_a_robot_roams_by_bytes_on_two_serial_lines(home: Home) -> None:
     assert report["min_clearance_m"] > 0.05
 
 
-async def test_a_real_body_starts_neither_released_nor_enabled(home: Home) -> None:
+async def test_a_real_body_is_not_enabled_at_the_start(home: Home) -> None:
     demo = await home.run(
         *AVOID, "--body", "mycustombot", "--link", "real", "--seconds", "1.5", "--headless"
     )

@@ -1,4 +1,4 @@
-"""The ports of emulators: they appear, go, slow down, and are one emulator's at a time."""
+"""The ports of emulators: they appear, disappear, slow down, and belong to one emulator."""
 
 import asyncio
 import os
@@ -43,7 +43,7 @@ async def test_a_port_appears_disappears_and_comes_back_empty(tmp_path: Path) ->
     pty.unplug()
 
 
-async def test_a_host_that_goes_and_comes_back_finds_the_same_port(tmp_path: Path) -> None:
+async def test_a_host_that_reconnects_finds_the_same_port(tmp_path: Path) -> None:
     pty, received = Pty(tmp_path / "port"), list[bytes]()
     pty.on_bytes = received.append
     pty.plug()
@@ -84,7 +84,7 @@ async def test_a_slow_line_takes_ten_bits_a_byte(tmp_path: Path) -> None:
     pty.unplug()
 
 
-async def test_what_is_on_the_wire_when_it_is_unplugged_is_gone(tmp_path: Path) -> None:
+async def test_bytes_on_the_wire_are_lost_when_it_is_unplugged(tmp_path: Path) -> None:
     pty = Pty(tmp_path / "port", baud=9600)
     pty.plug()
     pty.write(b"x" * 48)
@@ -99,7 +99,7 @@ async def test_what_is_on_the_wire_when_it_is_unplugged_is_gone(tmp_path: Path) 
 
 
 @pytest.mark.skipif(not os.path.isdir("/proc/self/fd"), reason="needs /proc")
-def test_the_port_of_an_emulator_that_was_killed_leads_nowhere(tmp_path: Path) -> None:
+def test_the_port_of_a_killed_emulator_cannot_be_opened(tmp_path: Path) -> None:
     port = tmp_path / "base"
     program = (
         "import asyncio, os, pathlib, signal, sys\n"
@@ -117,7 +117,7 @@ def test_the_port_of_an_emulator_that_was_killed_leads_nowhere(tmp_path: Path) -
     assert ran.stdout.startswith("/dev/")
     name, opened = ran.stdout.strip(), list[int]()
     try:
-        for _ in range(50):  # until the name is somebody else's
+        for _ in range(50):  # until another pty has the name
             opened.extend(os.openpty())
             if os.ttyname(opened[-1]) == name:
                 break
@@ -128,10 +128,10 @@ def test_the_port_of_an_emulator_that_was_killed_leads_nowhere(tmp_path: Path) -
             os.close(descriptor)
 
 
-async def test_a_port_that_is_another_emulators_by_now_is_left(tmp_path: Path) -> None:
+async def test_unplugging_leaves_a_port_that_another_emulator_has_replaced(tmp_path: Path) -> None:
     first, second = Pty(tmp_path / "base"), Pty(tmp_path / "base")
     first.plug()
-    second.plug()  # as after a folder was cleared and claimed anew
+    second.plug()  # as if the folder was cleared and claimed again
     mine = os.readlink(tmp_path / "base")
     first.unplug()
     assert os.readlink(tmp_path / "base") == mine
@@ -139,7 +139,7 @@ async def test_a_port_that_is_another_emulators_by_now_is_left(tmp_path: Path) -
     assert not (tmp_path / "base").is_symlink()
 
 
-async def test_a_file_that_is_no_port_is_not_replaced(tmp_path: Path) -> None:
+async def test_an_ordinary_file_is_not_replaced_by_a_port(tmp_path: Path) -> None:
     (tmp_path / "base").write_text("somebody's")
     run = Run(folder=Path(), link="emulated", emulator=str(tmp_path))
     with pytest.raises(ConfigError, match=r"cannot create ports in .*base exists"):
@@ -148,7 +148,7 @@ async def test_a_file_that_is_no_port_is_not_replaced(tmp_path: Path) -> None:
     assert (tmp_path / "base").read_text() == "somebody's"
 
 
-def test_a_folder_of_ports_is_one_emulators_at_a_time(tmp_path: Path) -> None:
+def test_a_folder_of_ports_can_be_used_by_one_emulator_only(tmp_path: Path) -> None:
     folder = tmp_path / "ports"
     with claimed(folder), pytest.raises(ConfigError, match="another emulator"), claimed(folder):
         pass

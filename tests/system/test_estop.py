@@ -19,7 +19,7 @@ from gigabrain_zenoh.testing.waiting import until
 
 @pytest.fixture(scope="module")
 def deployment(shared_home: Home) -> Path:
-    """A Waffle that goes on by itself after anything that does not latch."""
+    """A Waffle that resumes by itself unless the gate latches."""
     file = shared_home.deployment(world="arena", resume="auto", decision={"linear_speed": 0.26})
     shared_home.start("up", str(file))
     return file
@@ -27,25 +27,25 @@ def deployment(shared_home: Home) -> Path:
 
 @pytest.fixture
 async def robot(deployment: Path) -> AsyncIterator[Probe]:
-    """The robot, driving straight on."""
+    """The robot, which drives straight ahead."""
     async with probing(endpoint_of(deployment), "operator") as onlooker:
         if onlooker.state.gate.mode == "latched" and onlooker.state.gate.estop_generation:
-            await go_on(onlooker)
+            await release_and_enable(onlooker)
         await onlooker.driving_straight()
         yield onlooker
 
 
-async def go_on(robot: Probe) -> None:
-    """A person releases the latch and lets the brain drive."""
+async def release_and_enable(robot: Probe) -> None:
+    """Release the latch and enable the brain, as an operator does."""
     person = Robot(robot.bus)
     await robot.at_rest(ticks=30)
     assert (await person.release()).ok
     await robot.ticks(40)
-    assert robot.state.gate.mode == "idle"  # also where it resumes by itself: a person stopped it
+    assert robot.state.gate.mode == "idle"  # also with resume: auto, because an operator stopped it
     await robot.enable_brain()
 
 
-async def test_it_stops_the_body_and_keeps_it_stopped(robot: Probe) -> None:
+async def test_an_estop_stops_the_body_and_keeps_it_stopped(robot: Probe) -> None:
     generation, start = robot.state.gate.estop_generation, robot.state
     reply = await Robot(robot.bus).estop("a chair is in the way")
     assert (reply.ok, reply.gate.mode) == (True, "latched")
@@ -60,11 +60,11 @@ async def test_it_stops_the_body_and_keeps_it_stopped(robot: Probe) -> None:
     await until(lambda: "a chair is in the way" in " ".join(r.text for r in robot.logs), "its log")
     with pytest.raises(Refused, match=r"latched: e-stop pressed by operator .*; release it first"):
         await Robot(robot.bus, take=True).set_base_velocity(0.2)
-    await go_on(robot)
+    await release_and_enable(robot)
     await robot.driving_straight(room=0.0)
 
 
-async def test_the_command_says_who_has_confirmed_it(
+async def test_the_estop_command_names_the_robot_that_confirmed_it(
     robot: Probe, shared_home: Home, deployment: Path
 ) -> None:
     start = robot.state
@@ -91,7 +91,7 @@ async def test_the_command_says_who_has_confirmed_it(
     assert robot.state.gate.enables > start.gate.enables
 
 
-async def test_it_survives_the_death_of_the_driver(robot: Probe) -> None:
+async def test_an_estop_survives_the_death_of_the_driver(robot: Probe) -> None:
     generation = (await Robot(robot.bus).estop()).gate.estop_generation
     before = robot.state
     os.kill(await robot.pid("driver"), signal.SIGKILL)
@@ -101,11 +101,11 @@ async def test_it_survives_the_death_of_the_driver(robot: Probe) -> None:
     assert [cause.code for cause in robot.state.gate.causes] == ["estop"]
     assert robot.state.gate.estop_generation == generation
     assert (robot.state.pose.x, robot.state.pose.y) == (0.0, 0.0)
-    await go_on(robot)
+    await release_and_enable(robot)
     await robot.driving_straight(room=0.0)
 
 
-async def test_only_who_knows_of_the_newest_e_stop_can_release_it(robot: Probe) -> None:
+async def test_a_release_must_name_the_newest_estop(robot: Probe) -> None:
     person = Robot(robot.bus)
     first = (await person.estop()).gate.estop_generation
     await person.estop()
@@ -113,5 +113,5 @@ async def test_only_who_knows_of_the_newest_e_stop_can_release_it(robot: Probe) 
     replies = await robot.bus.ask(RELEASE, ReleaseRequest(estop_generation=first))
     assert (replies[0].ok, replies[0].gate.estop_generation) == (False, first + 1)
     assert robot.state.gate.mode == "latched"
-    await go_on(robot)
+    await release_and_enable(robot)
     await robot.driving_straight(room=0.0)

@@ -30,9 +30,9 @@ LONGEST_S = 300.0
 
 
 class Example(NamedTuple):
-    """The arguments of a program, a part of its output, and the files that it makes."""
+    """The arguments of a program, a part of its output, and the files that it writes."""
 
-    arguments: tuple[str, ...] = ()  # ENDPOINT and DRIVE stand for those of the robot
+    arguments: tuple[str, ...] = ()  # ENDPOINT and DRIVE are replaced by the robot's
     prints: str = ""
     makes: tuple[str, ...] = ()
 
@@ -58,7 +58,7 @@ PROGRAMS = {
 NOTEBOOKS = ("first_look", "recording")
 
 
-def test_every_example_is_run() -> None:
+def test_every_example_is_tested() -> None:
     assert {path.stem for path in EXAMPLES.glob("*.py")} == {*PROGRAMS}
     assert {path.stem for path in EXAMPLES.glob("*.ipynb")} == {*NOTEBOOKS}
     tests = "".join(path.read_text() for path in (ROOT / "tests").rglob("*.py"))
@@ -67,24 +67,24 @@ def test_every_example_is_run() -> None:
 
 
 @pytest.mark.parametrize("name", PROGRAMS)
-def test_a_program_is_short_and_says_what_it_shows(name: str) -> None:
+def test_a_program_is_short_and_has_a_docstring(name: str) -> None:
     source = (EXAMPLES / f"{name}.py").read_text()
     assert source.count("\n") < 60
     assert (ast.get_docstring(ast.parse(source)) or "").split("\n")[0][-1] in ".:"
 
 
-def test_the_index_says_of_each_program_what_the_program_says() -> None:
+def test_the_index_has_the_docstring_of_each_program() -> None:
     index = (EXAMPLES / "README.md").read_text()
-    said = {
+    docstrings = {
         name: (ast.get_docstring(ast.parse((EXAMPLES / f"{name}.py").read_text())) or "")
         for name in PROGRAMS
     }
-    rows = {f"| `{name}.py` | {text.splitlines()[0]} |" for name, text in said.items()}
+    rows = {f"| `{name}.py` | {text.splitlines()[0]} |" for name, text in docstrings.items()}
     assert rows - set(index.splitlines()) == set()
 
 
 @pytest.mark.parametrize("name", NOTEBOOKS)
-def test_a_notebook_holds_no_outputs(name: str) -> None:
+def test_a_notebook_is_stored_without_outputs(name: str) -> None:
     cells = json.loads((EXAMPLES / f"{name}.ipynb").read_text())["cells"]
     code = [cell for cell in cells if cell["cell_type"] == "code"]
     assert [(cell["outputs"], cell["execution_count"]) for cell in code] == [([], None)] * len(code)
@@ -99,7 +99,7 @@ def test_a_notebook_holds_no_outputs(name: str) -> None:
         ("go_to.py", ("kitchen",), "python go_to.py [X Y]"),
     ],
 )
-def test_a_program_says_which_arguments_it_takes(
+def test_wrong_arguments_print_the_usage(
     program: str, arguments: tuple[str, ...], line: str
 ) -> None:
     done = run(program, *arguments)
@@ -117,7 +117,7 @@ def test_a_program_says_which_arguments_it_takes(
         ),
     ],
 )
-def test_a_program_without_the_package_says_that_the_robot_is_silent(
+def test_a_program_without_this_package_reports_a_silent_robot(
     program: str, arguments: tuple[str, ...], line: str
 ) -> None:
     endpoint = free_endpoint()
@@ -127,13 +127,13 @@ def test_a_program_without_the_package_says_that_the_robot_is_silent(
 
 
 def run(program: str, *arguments: str) -> subprocess.CompletedProcess[str]:
-    """Run a program to its end."""
+    """Run a program to its end and return it."""
     command = (sys.executable, str(EXAMPLES / program), *arguments)
     return subprocess.run(command, capture_output=True, text=True, timeout=LONGEST_S)
 
 
 class Robot(NamedTuple):
-    """A robot that maps and drives, with its recording so far."""
+    """A robot that maps and drives, with its recording."""
 
     home: Home
     endpoint: Endpoint

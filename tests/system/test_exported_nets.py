@@ -1,7 +1,7 @@
-"""Nets as people export them: from their own packages, in an environment of its own.
+"""Nets as users export them: by their own packages, in a separate environment.
 
-The first test installs some 1.5 GB, so they are left to `make qa`; they are skipped, with the
-reason, where the packages or a torch without CUDA cannot be had.
+The first test installs some 1.5 GB, so they run in `make qa` only. They are skipped with a reason
+if the packages or a torch without CUDA are not available.
 """
 
 import json
@@ -17,7 +17,7 @@ from tests.places import ROOT
 
 pytestmark = pytest.mark.qa
 RUNTIME = ("numpy", "onnx", "onnxruntime", "opencv-python-headless", "msgspec", "pyyaml", "pillow")
-PACKAGES = {  # with what they import; big ones without what they need, which would be CUDA's
+PACKAGES = {  # with their imports; big ones without dependencies, as those include CUDA
     "ultralytics": "ultralytics ultralytics-thop torchvision requests psutil polars matplotlib "
     "scipy",
     "transformers": "transformers torchvision scipy",
@@ -28,7 +28,7 @@ BIG = ("ultralytics", "ultralytics-thop", "torchvision", "rfdetr", "supervision"
 
 
 def pip(python: Path, *words: str) -> str:
-    """Run pip; skip the test with its last error where something cannot be had."""
+    """Run pip; skip the test with pip's last error if something is not available."""
     made = subprocess.run(
         (python, "-m", "pip", *words), capture_output=True, text=True, check=False
     )
@@ -40,7 +40,7 @@ def pip(python: Path, *words: str) -> str:
 
 @pytest.fixture(scope="module")
 def python(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return the interpreter of an environment with a torch that needs no CUDA."""
+    """Return the interpreter of an environment with a torch without CUDA."""
     folder = tmp_path_factory.mktemp("environment")
     subprocess.run((sys.executable, "-m", "venv", folder), check=True)
     there = folder / "bin" / "python"
@@ -62,7 +62,7 @@ def python(tmp_path_factory: pytest.TempPathFactory) -> Path:
         ("rf_detr", "rfdetr"),
     ],
 )
-def test_an_exported_net_finds_the_boxes_of_its_own_package(
+def test_our_boxes_agree_with_those_of_the_exporting_package(
     net: str, package: str, python: Path, tmp_path: Path
 ) -> None:
     wanted = PACKAGES[package].split()

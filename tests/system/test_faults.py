@@ -1,4 +1,4 @@
-"""The fault suite on real processes: some rows here, all of them in `make qa`."""
+"""The fault suite on real processes: some of its rows here, all in `make qa`."""
 
 import asyncio
 
@@ -8,7 +8,7 @@ from gigabrain_zenoh.qa.faults.rig import Options
 from gigabrain_zenoh.qa.faults.suite import FAULTS, run_suite
 from gigabrain_zenoh.qa.judging import FaultResult, FaultRow
 
-# a process, the gate, a link, the router, the e-stop, and a camera
+# one of each kind: process, gate, link, router, e-stop, camera
 QUICK = (
     "decision-killed",
     "gate-killed",
@@ -27,7 +27,7 @@ ROWS = [
 def results(
     request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
 ) -> dict[int, FaultResult]:
-    """The result of each chosen row, judged by ticks alone; they share robots: one go for all."""
+    """Run all chosen rows at once, because they share robots; return their results in ticks."""
     own = [i for i in request.session.items if i.path == request.path]
     chosen = [fault for fault in FAULTS if any(f"[{fault.name}]" in item.name for item in own)]
     folder, options = tmp_path_factory.mktemp("faults"), Options(wall=False)
@@ -37,7 +37,7 @@ def results(
 
 @pytest.mark.slow
 @pytest.mark.parametrize("fault", ROWS)
-def test_the_robot_stops_whatever_breaks(fault: FaultRow, results: dict[int, FaultResult]) -> None:
+def test_the_robot_stops_at_each_fault(fault: FaultRow, results: dict[int, FaultResult]) -> None:
     result = results[fault.number]
     if result.verdict == "skipped":
         pytest.skip(result.reason)

@@ -24,18 +24,18 @@ from gigabrain_zenoh.testing.waiting import until
 from tests.system.servos import emulated_arm
 from tests.unit.drivers.feetech import FOLDER, OPTIONS, ROBOT, FreeArm
 
-MOUNTED = [2100, 1900, 3900, 300, 2048, 1500]  # ticks of the encoders where the joints are at 0
+ZERO_TICKS = [2100, 1900, 3900, 300, 2048, 1500]  # [encoder ticks] of the joints at 0 rad
 ONE_DEGREE = 0.0175
 
 
 class Calibration:
-    """The command in a terminal, and the arm beside it."""
+    """The command in a terminal, and the emulated arm."""
 
     def __init__(self, arm: FeetechArm, body: FreeArm, file: Path) -> None:
         self.arm, self.body, self.file = arm, body, file
-        self.trigger = 1.0  # share of a gripper's range that its joint can be moved through
+        self.trigger = 1.0  # share of the gripper's range that its joint can reach
         self.text = ""
-        self.reads: Counter[int] = Counter()  # of positions, by servo
+        self.reads: Counter[int] = Counter()  # position reads by servo
         self._execute = arm.bus.execute
         arm.bus.execute = self._count  # type: ignore[method-assign]
 
@@ -57,17 +57,17 @@ class Calibration:
     def _readable(self) -> None:
         try:
             self.text += os.read(self._terminal, READ_BYTES).decode(errors="replace")
-        except OSError:  # it has ended
+        except OSError:  # the command ended
             asyncio.get_running_loop().remove_reader(self._terminal)
 
     async def answer(self, request: str, typed: str = "") -> None:
-        """Wait for a request, and type a line."""
+        """Wait for a request of the command, and type a line."""
         await until(lambda: request in self.text)
         self.text = self.text.partition(request)[2]
         os.write(self._terminal, f"{typed}\n".encode())
 
     async def move(self, share: float) -> None:
-        """Move all joints to a share of their range, and wait until that was looked at."""
+        """Move all joints to a share of their range, and wait until the command read that."""
         for joint, its in zip(ROBOT.joints, self.body.free.values(), strict=True):
             reach = self.trigger if joint.part == "gripper" else 1.0
             off = (share - 0.5) * reach * (joint.upper - joint.lower)
@@ -89,10 +89,10 @@ class Calibration:
 
 @asynccontextmanager
 async def calibrating(folder: Path, *options: str) -> AsyncIterator[Calibration]:
-    """A new arm, whose servos keep nothing, and the command that begins to calibrate it."""
+    """Run the command on a new arm, whose servos have no stored calibration."""
     port, file = folder / "base", folder / "so101.yaml"
     async with emulated_arm(port, replace(OPTIONS, calibration=str(file))) as (arm, body):
-        servos = [ServoModel(n, centre=at) for n, at in enumerate(MOUNTED, 1)]
+        servos = [ServoModel(n, centre=at) for n, at in enumerate(ZERO_TICKS, 1)]
         arm.servos = dict(zip(arm.servos, servos, strict=True))
         arm.bus.servos = servos
         it = Calibration(arm, body, file)
@@ -103,7 +103,7 @@ async def calibrating(folder: Path, *options: str) -> AsyncIterator[Calibration]
             await it.close()
 
 
-async def begin(it: Calibration, consent: str) -> None:
+async def answer_first_questions(it: Calibration, consent: str) -> None:
     await it.answer("Hold the arm")
     await until(lambda: "to the middle of its range" in it.text)
     assert not any(servo[feetech.TORQUE] for servo in it.arm.servos.values())
@@ -115,9 +115,9 @@ async def begin(it: Calibration, consent: str) -> None:
     await until(lambda: "from one end of its range" in it.text)
 
 
-async def test_an_arm_that_was_moved_by_hand_can_be_driven(tmp_path: Path) -> None:
+async def test_an_arm_calibrated_by_hand_can_be_driven(tmp_path: Path) -> None:
     async with calibrating(tmp_path) as it:
-        await begin(it, "y")
+        await answer_first_questions(it, "y")
         for share in (0.5, 0.0, 0.5):
             await it.move(share)
         await it.answer("from one end of its range")
@@ -140,10 +140,10 @@ async def test_an_arm_that_was_moved_by_hand_can_be_driven(tmp_path: Path) -> No
             await until(lambda: not driver.problem)
 
 
-async def test_a_leader_s_trigger_needs_no_more_than_its_own_range(tmp_path: Path) -> None:
+async def test_the_trigger_of_a_leader_needs_only_its_own_range(tmp_path: Path) -> None:
     async with calibrating(tmp_path, "--leader") as it:
         it.trigger = 0.3
-        await begin(it, "y")
+        await answer_first_questions(it, "y")
         for share in (0.5, 0.0, 0.5, 1.0):
             await it.move(share)
         await it.answer("from one end of its range")
@@ -158,7 +158,7 @@ async def test_a_leader_s_trigger_needs_no_more_than_its_own_range(tmp_path: Pat
 async def test_without_consent_no_servo_is_changed(tmp_path: Path) -> None:
     async with calibrating(tmp_path) as it:
         kept = {name: servo.kept for name, servo in it.arm.servos.items()}
-        await begin(it, "")
+        await answer_first_questions(it, "")
         for share in (0.5, 0.0, 0.5, 1.0, 0.5):
             await it.move(share)
         await it.answer("from one end of its range")

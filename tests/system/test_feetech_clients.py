@@ -1,6 +1,6 @@
-"""The emulated servo bus as other people's clients see it, over a real pty.
+"""The emulated servo bus with third-party clients, over a real pty.
 
-Each runs in an environment of its own: both SDKs of the vendor have the same import name.
+Each client runs in a separate environment: both SDKs of the vendor have the same import name.
 """
 
 import asyncio
@@ -17,12 +17,12 @@ from tests.system.servos import emulated_arm
 
 pytestmark = pytest.mark.qa
 PROGRAMS = ROOT / "tests/system/servo_clients"
-HOME = [2048, 1500, 2500, 2300, 2016, 1600]  # ticks from which the arm starts
-WITHIN = 8  # ticks, of the play of the gears and their friction
-PATIENCE = [3.0, 20.0]  # [s] that the arm gets to move; the longer where the machine was too busy
+HOME_TICKS = [2048, 1500, 2500, 2300, 2016, 1600]  # [ticks], start posture
+TOLERANCE_TICKS = 8  # play and friction of the gears
+MOVE_TIMES_S = [3.0, 20.0]  # the longer one for a busy machine
 
 
-async def told(package: str, program: str, port: Path, seconds: float) -> dict[str, Any]:
+async def run_client(package: str, program: str, port: Path, seconds: float) -> dict[str, Any]:
     """Run a client, and return the JSON that it prints."""
     uv = [sys.executable, "-m", "uv", "run", "-q", "--isolated", "--no-project"]
     command = [*uv, "--with", package, "python", str(PROGRAMS / program), str(port), str(seconds)]
@@ -35,23 +35,27 @@ async def told(package: str, program: str, port: Path, seconds: float) -> dict[s
     return seen
 
 
-async def moved(package: str, program: str, port: Path) -> dict[str, Any]:
+async def run_moving_client(package: str, program: str, port: Path) -> dict[str, Any]:
     """Run a client that moves the arm, and return the JSON that it prints.
 
     Where the arm misses its goals, the client runs again, for longer.
     """
-    for seconds in PATIENCE:
+    for seconds in MOVE_TIMES_S:
         async with emulated_arm(port) as (arm, body):
-            for joint, servo, at in zip(body.free.values(), arm.servos.values(), HOME, strict=True):
+            for joint, servo, at in zip(
+                body.free.values(), arm.servos.values(), HOME_TICKS, strict=True
+            ):
                 joint.position = servo.angle(at)
             arm.reset()
-            seen = await told(package, program, port, seconds)
-        goals = [2200, 1400, 2600, *HOME[3:]]
-        if all(abs(at - goal) <= WITHIN for at, goal in zip(seen["after"], goals, strict=True)):
+            seen = await run_client(package, program, port, seconds)
+        goals = [2200, 1400, 2600, *HOME_TICKS[3:]]
+        if all(
+            abs(at - goal) <= TOLERANCE_TICKS for at, goal in zip(seen["after"], goals, strict=True)
+        ):
             break
     else:
         pytest.fail(f"{seen['after']} instead of {goals}")
-    assert seen["before"] == HOME
+    assert seen["before"] == HOME_TICKS
     return seen
 
 
@@ -65,14 +69,14 @@ async def moved(package: str, program: str, port: Path) -> dict[str, Any]:
 async def test_the_vendors_sdk_finds_reads_and_moves_the_arm(
     package: str, program: str, tmp_path: Path
 ) -> None:
-    seen = await moved(package, program, tmp_path / "base")
+    seen = await run_moving_client(package, program, tmp_path / "base")
     assert seen["models"] == [777] * 6
     assert not any(seen["results"])
     assert seen["missing"] == -6  # there is no status packet
 
 
 async def test_rustypot_finds_reads_and_moves_the_arm(tmp_path: Path) -> None:
-    seen = await moved("rustypot==1.13.1", "rustypot_client.py", tmp_path / "base")
+    seen = await run_moving_client("rustypot==1.13.1", "rustypot_client.py", tmp_path / "base")
     assert seen["pinged"] == [True] * 6
     assert seen["models"] == [777] * 6
     assert seen["volts"] == [74] * 6

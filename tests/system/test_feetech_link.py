@@ -19,7 +19,7 @@ def arm_on(port: Path) -> FeetechDriver:
     )
 
 
-async def test_a_second_arm_on_the_same_port_is_refused_and_the_first_goes_on(
+async def test_a_second_driver_on_the_same_port_is_refused_and_the_first_goes_on(
     tmp_path: Path,
 ) -> None:
     port = tmp_path / "base"
@@ -32,7 +32,7 @@ async def test_a_second_arm_on_the_same_port_is_refused_and_the_first_goes_on(
         await until(lambda: not first.problem)
 
 
-async def test_an_arm_that_is_not_there_is_waited_for(tmp_path: Path) -> None:
+async def test_the_driver_waits_for_a_missing_arm(tmp_path: Path) -> None:
     port = tmp_path / "base"
     async with arm_on(port) as driver:
         assert "is it plugged in?" in driver.problem

@@ -26,17 +26,17 @@ from gigabrain_zenoh.testing.waiting import until
 from tests.places import ROOT
 
 EXAMPLE = ROOT / "examples/follow_the_leader"
-WAY_M = 13.0  # a round and a corner more
-NEAREST_M, FARTHEST_M = 0.5, 1.2  # from middle to middle; both are some 0.2 m round
+LEADER_PATH_M = 13.0  # a round and one more corner
+NEAREST_M, FARTHEST_M = 0.5, 1.2  # between the middles of two bodies of some 0.2 m radius
 CAUGHT_UP_M = 1.0
 
 
 class HomeWithExample(Home):
-    """A user's folders, where the example is installed."""
+    """A home folder where the example is installed."""
 
     @property
     def environment(self) -> dict[str, str]:
-        """The environment of its processes."""
+        """Return the environment of its processes."""
         found = super().environment
         return found | {"PYTHONPATH": f"{found['PYTHONPATH']}{os.pathsep}{self.folder / 'site'}"}
 
@@ -70,7 +70,7 @@ def test_it_backs_away_from_a_leader_who_comes_nearer(monkeypatch: pytest.Monkey
         assert math.copysign(1.0, intent.twist.linear_x) == sign
 
 
-def test_a_leader_where_the_scan_begins_is_one_thing(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_leader_at_the_first_beam_is_found_as_one_object(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.syspath_prepend(EXAMPLE)
     example = importlib.import_module("follow_the_leader")
     left = [(0.9, 0.0), (0.9, 0.1), (0.9, 0.2)]
@@ -86,7 +86,7 @@ def test_a_leader_where_the_scan_begins_is_one_thing(monkeypatch: pytest.MonkeyP
 
 
 def inputs(x: float | None, tick: int, boot: int = 1) -> PerceptorInputs:
-    """Return the inputs of a scan of one thing at `x` [m] ahead or behind; None for nothing."""
+    """Return the inputs for a scan of one object at `x` [m] ahead or behind; None for no object."""
     body = load_robot("turtlebot3_waffle").description()
     assert body.lidar
     ranges = open_space()
@@ -101,7 +101,7 @@ def inputs(x: float | None, tick: int, boot: int = 1) -> PerceptorInputs:
     )
 
 
-def test_a_leader_who_was_hidden_is_not_taken_for_a_thing_across_the_hall(
+def test_a_hidden_leader_is_not_confused_with_an_object_across_the_hall(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.syspath_prepend(EXAMPLE)
@@ -115,7 +115,7 @@ def test_a_leader_who_was_hidden_is_not_taken_for_a_thing_across_the_hall(
     assert found.x == pytest.approx(1.65, abs=0.1)
 
 
-def test_a_leader_is_looked_for_again_after_a_start_of_the_driver(
+def test_the_leader_is_searched_again_after_a_restart_of_the_driver(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.syspath_prepend(EXAMPLE)
@@ -129,13 +129,13 @@ def test_a_leader_is_looked_for_again_after_a_start_of_the_driver(
 
 
 @pytest.mark.slow
-async def test_it_follows_a_person_round_corners_keeps_its_distance_and_touches_nobody(
+async def test_it_follows_a_person_round_corners_at_a_distance_without_contact(
     tmp_path: Path,
 ) -> None:
     home = HomeWithExample(tmp_path)
     install(home.folder / "site")
-    distances: list[float] = []  # by the physics, from the person to the robot
-    way = [0.0, 0.0]  # of the person, and of the robot [m]
+    distances: list[float] = []  # true ones, from person to robot [m]
+    way = [0.0, 0.0]  # driven by person and robot [m]
     last: list[np.ndarray] = []
 
     def measure(_key: str, message: SimPoses) -> None:
@@ -153,14 +153,14 @@ async def test_it_follows_a_person_round_corners_keeps_its_distance_and_touches_
             states = bus.latest(STATE)
             await until(lambda: states.newest and states.newest.gate.mode == "enabled", "it may")
             bus.subscribe(SIM_POSES, measure)
-            # the person has walked on while the robot's processes were starting
+            # the person walked on while the robot's processes started
             await until(lambda: distances and distances[-1] < CAUGHT_UP_M, "it has caught up")
             distances.clear()
-            await until(lambda: way[0] > WAY_M, "the person has walked", within_s=90)
+            await until(lambda: way[0] > LEADER_PATH_M, "the person has walked", within_s=90)
             (driver,) = await bus.ask(DESCRIBE, DescribeRequest(), timeout_s=10, name="driver")
     finally:
         home.close()
     assert driver.report["contacts"] == 0
     assert min(distances) > NEAREST_M
     assert max(distances) < FARTHEST_M
-    assert way[1] > 0.7 * WAY_M  # it cuts corners
+    assert way[1] > 0.7 * LEADER_PATH_M  # the robot cuts corners

@@ -52,7 +52,7 @@ def package(site: Path) -> Path:
     return folder
 
 
-async def test_a_packages_driver_drives_the_packages_emulator(package: Path) -> None:
+async def test_a_packaged_driver_drives_the_packaged_emulator(package: Path) -> None:
     async with CheckedRobot(NAME, "emulated", package / "run") as subject:
         assert subject.promise == "80 ms (its data sheet)"
         async with DriverSession(subject) as session:
@@ -61,7 +61,7 @@ async def test_a_packages_driver_drives_the_packages_emulator(package: Path) -> 
             assert await session.until(lambda: subject.commanded(None)[0] == 0.2, 100) is not None
 
 
-def test_its_emulator_is_found_by_its_drivers_name(package: Path) -> None:
+def test_a_packaged_emulator_is_found_by_the_name_of_its_driver(package: Path) -> None:
     assert device_class(NAME).__name__ == "ForeignBoard"
     robot, driver = catalog.make_driver(NAME, Run(folder=Path(), link="real"))
     assert (robot.robot_type, type(driver).__name__) == (NAME, "ForeignDriver")

@@ -68,7 +68,7 @@ def package(site: Path) -> None:
     (site / f"{NAME}_source.py").write_text(SOURCE)
 
 
-async def test_a_body_carries_the_lidar_of_a_package(tmp_path: Path) -> None:
+async def test_a_body_can_use_a_packaged_lidar(tmp_path: Path) -> None:
     file, port = tmp_path / "robot.yaml", tmp_path / "scan"
     file.write_text(f"{BODY}  scan: {{driver: {NAME}, port: {port}, mirrored: true}}\n")
     _, driver = make_driver(str(file), Run(folder=tmp_path, link="real"))
@@ -80,11 +80,11 @@ async def test_a_body_carries_the_lidar_of_a_package(tmp_path: Path) -> None:
     assert agree(scans[-1], truth()) > 0.97
 
 
-def test_its_name_is_suggested_where_it_is_misspelt() -> None:
+def test_the_name_of_a_packaged_lidar_is_suggested_if_misspelt() -> None:
     with pytest.raises(UnknownName, match="no lidar 'forein_lidar'; did you mean 'foreign_lidar'"):
         source_class("forein_lidar")
 
 
-def test_a_class_that_the_package_does_not_have_is_named() -> None:
+def test_a_missing_class_of_a_package_is_named() -> None:
     with pytest.raises(ConfigError, match="lidar 'lost_lidar' of foreign_lidar_source:LostLidar"):
         source_class("lost_lidar")

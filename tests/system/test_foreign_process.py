@@ -1,4 +1,4 @@
-"""A package may bring a process of its own: entry point `gigabrain.processes`, one row."""
+"""A package may bring its own process: entry point `gigabrain.processes`, one row."""
 
 import os
 import shutil
@@ -66,7 +66,7 @@ def package(site: Path) -> Path:
 
 
 class HomeWithLamp(Home):
-    """A user's folders, where the package is installed."""
+    """A home folder where the package is installed."""
 
     def __init__(self, folder: Path, site: Path) -> None:
         super().__init__(folder)
@@ -74,7 +74,7 @@ class HomeWithLamp(Home):
 
     @property
     def environment(self) -> dict[str, str]:
-        """The environment of its processes."""
+        """Return the environment of its processes."""
         found = super().environment
         return found | {"PYTHONPATH": f"{found['PYTHONPATH']}{os.pathsep}{self._site}"}
 
@@ -85,7 +85,7 @@ def written(folder: Path, text: str) -> Path:
     return path
 
 
-def test_its_settings_are_a_part_of_deployment_files_and_checked_like_ours(tmp_path: Path) -> None:
+def test_deployment_files_can_have_its_settings_which_are_checked(tmp_path: Path) -> None:
     placed = "hosts: {robot: [router, driver, lamp]}\n"
     deployment = load_deployment(written(tmp_path, placed + "lamp: {port: /dev/lamp}\n"))
     spec = process_specs(deployment, "robot", tmp_path, tmp_path / "state")[-1]
@@ -102,7 +102,7 @@ def test_its_settings_are_a_part_of_deployment_files_and_checked_like_ours(tmp_p
         process_type("lamb")
 
 
-def test_it_needs_an_identity_of_its_own_beside_that_of_its_host(tmp_path: Path) -> None:
+def test_it_needs_its_own_identity_besides_that_of_its_host(tmp_path: Path) -> None:
     fleet, host = tmp_path / "home", tmp_path / "home" / "robot@red"
     new_fleet("home", fleet)
     issue(fleet, "robot", robot="red")
@@ -117,7 +117,7 @@ def test_it_needs_an_identity_of_its_own_beside_that_of_its_host(tmp_path: Path)
     check_keys(deployment, "h")
 
 
-def test_it_writes_what_its_row_declares_and_what_tells_of_itself() -> None:
+def test_it_may_publish_its_declared_keys_its_health_and_its_log() -> None:
     table = Table(names_by_role(), grants=grants())
     rules = {rule["id"]: rule for rule in access_control(["red"], table)["rules"]}
     assert rules["process.lamp@red says"]["key_exprs"] == [
@@ -126,7 +126,9 @@ def test_it_writes_what_its_row_declares_and_what_tells_of_itself() -> None:
 
 
 @pytest.mark.slow
-async def test_up_starts_it_and_restarts_it_when_it_hangs(tmp_path: Path, package: Path) -> None:
+async def test_up_starts_a_packaged_process_and_restarts_it_when_it_hangs(
+    tmp_path: Path, package: Path
+) -> None:
     home, hang = HomeWithLamp(tmp_path / "home", package), tmp_path / "hang"
     router = f"tcp/127.0.0.1:{free_port()}"
     file = home.deployment(

@@ -1,4 +1,4 @@
-"""Processes that a fork server starts behave as those that are started by themselves."""
+"""Processes started by a fork server behave like those started directly."""
 
 import contextlib
 import os
@@ -39,11 +39,11 @@ NEVER = (("tests.system.never_imported",),)
 def path(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     monkeypatch.setenv("PYTHONPATH", str(ROOT))
     yield
-    forking.end_early()  # where a test has failed
+    forking.end_early()  # in case the test failed
 
 
 def servers() -> list[psutil.Process]:
-    """The fork server of the first level that this process has started."""
+    """Return the first-level fork servers that this process started."""
     return [one for one in psutil.Process().children() if "fork_server" in " ".join(one.cmdline())]
 
 
@@ -51,7 +51,7 @@ async def until_ready(supervisor: Supervisor) -> None:
     await until(lambda: all(one.state == "ready" for one in supervisor.statuses.values()))
 
 
-async def test_a_fork_is_a_child_of_its_supervisor_and_the_servers_end() -> None:
+async def test_a_fork_is_a_child_of_its_supervisor_and_the_servers_exit() -> None:
     async with running(forked("one"), forked("two"), spec("three")) as (supervisor, records):
         await until_ready(supervisor)
         one, two, three = (psutil.Process(s.pid) for s in supervisor.statuses.values())
@@ -61,7 +61,7 @@ async def test_a_fork_is_a_child_of_its_supervisor_and_the_servers_end() -> None
         assert not servers()
         assert not records.texts("fork server")
         own = one.memory_full_info().uss
-        assert own < 0.5 * one.memory_info().rss  # the rest is shared with the other one
+        assert own < 0.5 * one.memory_info().rss  # the rest is shared
 
 
 async def test_several_supervisors_of_one_process_fork_at_once() -> None:
@@ -73,7 +73,7 @@ async def test_several_supervisors_of_one_process_fork_at_once() -> None:
             assert not records.texts("fork server")
 
 
-async def test_a_fork_that_dies_is_started_again_by_itself() -> None:
+async def test_a_dead_fork_is_restarted_without_a_server() -> None:
     async with running(forked("one"), forked("two")) as (supervisor, records):
         status = supervisor.statuses["one"]
         await until_ready(supervisor)
@@ -93,16 +93,16 @@ async def test_a_fork_that_dies_is_started_again_by_itself() -> None:
         ("pass", "one ended with exit code 0; next start in 0.01 s"),
     ],
 )
-async def test_how_a_fork_ends_is_reported_with_its_output(code: str, text: str) -> None:
+async def test_the_exit_of_a_fork_is_reported_with_its_output(code: str, text: str) -> None:
     async with running(forked("one", code), forked("two")) as (_, records):
         await until(lambda: records.texts("died"))
         assert records.texts("died")[0].startswith(text)
-        said = "".join(records.texts("output"))
-        assert said.count("x") >= 99_999 * ("print" in code)
-        assert ("ValueError" in said) == ("raise" in code)
+        output = "".join(records.texts("output"))
+        assert output.count("x") >= 99_999 * ("print" in code)
+        assert ("ValueError" in output) == ("raise" in code)
 
 
-async def test_a_fork_starts_after_those_that_it_needs() -> None:
+async def test_a_fork_starts_after_the_processes_it_depends_on() -> None:
     async with running(forked("one", SERVE, "two"), forked("two"), forked("three")) as running_now:
         supervisor, records = running_now
         await until_ready(supervisor)
@@ -110,27 +110,31 @@ async def test_a_fork_starts_after_those_that_it_needs() -> None:
         assert order.index(("two", "ready")) < order.index(("one", "ready"))
 
 
-async def killed(server: psutil.Process) -> None:
+async def kill_server(server: psutil.Process) -> None:
     server.kill()
 
 
-async def frozen(server: psutil.Process) -> None:
+async def freeze_server(server: psutil.Process) -> None:
     await freeze(server.pid)
 
 
-async def left_alone(server: psutil.Process) -> None:
+async def leave_alone(server: psutil.Process) -> None:
     del server
 
 
 @pytest.mark.parametrize(
     ("fault", "why"),
-    [(killed, "has ended"), (frozen, "does not answer"), (left_alone, "does not answer")],
+    [
+        (kill_server, "has ended"),
+        (freeze_server, "does not answer"),
+        (leave_alone, "does not answer"),
+    ],
 )
-async def test_without_a_server_processes_start_by_themselves(
+async def test_with_a_failing_server_processes_are_started_directly(
     fault: Callable[[psutil.Process], object], why: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Its import never ends; one that is only slow is given up after a while."""
-    if fault is left_alone:
+    """The server's import never ends, so it is given up after a while."""
+    if fault is leave_alone:
         monkeypatch.setattr(forking, "IMPORT_TIMEOUT_S", 0.2)
         monkeypatch.setattr(forking, "STOPPED_CHECK_S", 0.1)
     specs = forked("one", imports=NEVER), forked("two", imports=NEVER)
@@ -138,31 +142,31 @@ async def test_without_a_server_processes_start_by_themselves(
         await until(servers)
         await fault(servers()[0])  # type: ignore[misc]
         await until_ready(supervisor)
-        told = [f"the fork server {why}; processes start without it, with more memory"]
-        assert records.texts("fork server") == told
+        warnings = [f"the fork server {why}; processes start without it, with more memory"]
+        assert records.texts("fork server") == warnings
         assert supervisor.deaths == 0
         assert not servers()
 
 
-async def test_where_no_server_can_start_processes_start_by_themselves(
+async def test_if_no_server_can_start_processes_are_started_directly(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(forking, "COMMAND", ("/nowhere/python",))
     async with running(forked("one"), forked("two")) as (supervisor, records):
         await until_ready(supervisor)
-        (told,) = records.texts("fork server")
-        assert told.startswith("the fork server cannot be started ([Errno 2] No such file")
+        (warning,) = records.texts("fork server")
+        assert warning.startswith("the fork server cannot be started ([Errno 2] No such file")
         assert supervisor.deaths == 0
 
 
-async def test_a_stop_does_not_wait_for_a_server_that_imports() -> None:
+async def test_a_stop_does_not_wait_for_an_importing_server() -> None:
     specs = forked("one", imports=NEVER), forked("two", imports=NEVER)
     async with running(*specs):
         await until(servers)
     assert not servers()
 
 
-async def test_a_supervisor_takes_over_a_server_that_was_started_early() -> None:
+async def test_a_supervisor_uses_a_server_that_was_started_early() -> None:
     forking.start_early("tests.system.children")
     (early,) = servers()
     async with running(forked("one"), forked("two")) as (supervisor, records):
@@ -173,7 +177,7 @@ async def test_a_supervisor_takes_over_a_server_that_was_started_early() -> None
     assert not early.is_running()
 
 
-async def test_an_early_server_that_no_process_needs_is_ended() -> None:
+async def test_an_unused_early_server_is_ended() -> None:
     forking.start_early()
     assert servers()
     async with running(forked("one"), spec("two")) as (supervisor, _):
@@ -181,7 +185,7 @@ async def test_an_early_server_that_no_process_needs_is_ended() -> None:
         await until_ready(supervisor)
 
 
-async def test_without_the_early_server_processes_start_by_themselves() -> None:
+async def test_after_the_death_of_the_early_server_processes_are_started_directly() -> None:
     forking.start_early()
     (early,) = servers()
     early.kill()
@@ -192,7 +196,7 @@ async def test_without_the_early_server_processes_start_by_themselves() -> None:
         assert supervisor.deaths == 0
 
 
-ABANDONS = """
+LEAVES_EARLY_SERVER = """
 from gigabrain_zenoh.runtime import forking
 forking.start_early("time")
 print(forking._early[0][0].pid)
@@ -200,9 +204,9 @@ print(forking._early[0][0].pid)
 
 
 def test_an_early_server_ends_with_the_command_that_started_it() -> None:
-    said = subprocess.check_output((sys.executable, "-c", ABANDONS), text=True)
+    pid = subprocess.check_output((sys.executable, "-c", LEAVES_EARLY_SERVER), text=True)
     with contextlib.suppress(psutil.NoSuchProcess):
-        psutil.Process(int(said)).wait(timeout=10)
+        psutil.Process(int(pid)).wait(timeout=10)
 
 
 @pytest.mark.parametrize(
@@ -225,7 +229,7 @@ def test_commands_that_run_a_robot_start_a_server_early(
 
 
 def all_forked(parent: str) -> str:
-    """The same supervisor, whose processes a fork server starts."""
+    """Return the supervisor program changed so that a fork server starts its processes."""
     made = parent.replace("specs = [", "from tests.system.children import forked\nspecs = [")
     made = made.replace('ProcessSpec(n, (sys.executable, "-c", code))', "forked(n)")
     assert made.count("forked") == 2
@@ -239,8 +243,8 @@ async def test_forks_die_with_their_supervisor() -> None:
         await until(lambda: not any(alive(pid) for pid in pids.values()))
 
 
-def test_what_servers_import_leaves_no_thread(tmp_path: Path) -> None:
-    """A fork has only the thread that forks, while locks of others stay held."""
+def test_imports_of_fork_servers_start_no_thread(tmp_path: Path) -> None:
+    """A fork has only the forking thread, and locks held by other threads stay locked."""
     rows = [name for name, row in PROCESSES.items() if row.forks and row.named]
     deployment = Deployment(
         hosts={"robot": tuple(rows)},

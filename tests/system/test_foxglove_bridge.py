@@ -1,4 +1,4 @@
-"""The bridge to Foxglove and Lichtblick: what a viewer sees is what was said, and who may steer."""
+"""The bridge to Foxglove and Lichtblick: viewers see the robot's messages, and some may steer."""
 
 import asyncio
 import base64
@@ -89,9 +89,9 @@ async def test_a_scan_arrives_in_foxgloves_schema_beam_by_beam(bridge: Bridge) -
     assert struct.unpack("<3d", seen[6]) == (1.0, 2.5, math.inf)
 
 
-async def test_every_kind_of_message_has_a_channel_to_be_drawn_from(bridge: Bridge) -> None:
-    said = (STATE, SCAN, WORLD, POSE, MAP, TASK, LOG, OBJECT_MAP)
-    for topic in said:
+async def test_every_kind_of_message_has_a_channel(bridge: Bridge) -> None:
+    published = (STATE, SCAN, WORLD, POSE, MAP, TASK, LOG, OBJECT_MAP)
+    for topic in published:
         message = EXAMPLES[topic.type.__name__]
         assert isinstance(message, topic.type)
         bridge.robot.publish(topic, message)
@@ -114,12 +114,12 @@ async def test_every_kind_of_message_has_a_channel_to_be_drawn_from(bridge: Brid
 
 
 async def steering(bridge: Bridge, viewer: Viewer) -> None:
-    """The viewer has the layout with the secret."""
+    """Make the viewer one that has the layout with the secret."""
     await viewer.publish_on(topic_to_steer(bridge.config))
     await hold(viewer, LEFT, lambda: bridge.steered)
 
 
-async def test_services_are_for_viewers_with_the_layout(bridge: Bridge) -> None:
+async def test_only_viewers_with_the_layout_can_call_services(bridge: Bridge) -> None:
     asked: list[str] = []
 
     def grant(what: str) -> Callable[[Message], Awaitable[GateReply]]:
@@ -145,15 +145,15 @@ async def test_services_are_for_viewers_with_the_layout(bridge: Bridge) -> None:
     assert set(asked) == {"robot/estop", "robot/release", "robot/enable"}
 
 
-async def test_a_service_says_why_it_is_refused(bridge: Bridge) -> None:
+async def test_a_refused_service_call_has_a_reason(bridge: Bridge) -> None:
     async with bridge.viewer() as viewer:
         await steering(bridge, viewer)
-        answer = await viewer.call("/release")  # no driver serves it, and no state is fresh
+        answer = await viewer.call("/release")  # no driver serves it
         assert answer["ok"] is False
         assert answer["text"]
 
 
-async def test_parameters_are_shown_to_all_and_set_by_viewers_with_the_layout(
+async def test_all_viewers_see_parameters_but_only_those_with_the_layout_set_them(
     bridge: Bridge,
 ) -> None:
     speeds = [0.26]
@@ -194,7 +194,7 @@ async def test_a_late_subscriber_gets_the_map(bridge: Bridge) -> None:
     )
 
 
-async def test_an_obstacle_is_drawn_where_it_is_and_with_where_it_goes(bridge: Bridge) -> None:
+async def test_an_obstacle_is_drawn_at_its_place_with_its_velocity(bridge: Bridge) -> None:
     one = Obstacle(id=7, x=1.5, y=-0.5, velocity_y=0.3, radius=0.2)
     world = WorldModel(scan_ok=True, obstacle_ahead=False, obstacles=(one,))
     bridge.robot.publish(WORLD, world)
@@ -205,7 +205,7 @@ async def test_an_obstacle_is_drawn_where_it_is_and_with_where_it_goes(bridge: B
         assert (entity[2], entity[3]) == (b"odom", b"7")
 
 
-async def test_what_is_large_and_stands_is_drawn_as_what_was_seen_of_it(bridge: Bridge) -> None:
+async def test_a_large_static_obstacle_is_drawn_by_its_visible_outline(bridge: Bridge) -> None:
     y = np.linspace(-1.0, 1.0, 41)
     one = Obstacle(id=7, x=1.5, y=0.0, radius=1.0)
     world = WorldModel(
@@ -219,12 +219,12 @@ async def test_what_is_large_and_stands_is_drawn_as_what_was_seen_of_it(bridge: 
         bridge.robot.publish(WORLD, world)
         entity = dict(fields(dict(fields(await viewer.message("/viz/obstacles")))[2]))
     assert (entity[2], entity[3]) == (b"base_link", b"7")
-    assert 10 not in entity  # cylinders
+    assert 10 not in entity  # no cylinders
     points = [data for number, data in fields(entity[11]) if number == 5]
     assert len(points) == 80  # both ends of 40 lines
 
 
-async def test_the_frames_join_map_and_robot(bridge: Bridge) -> None:
+async def test_the_frames_connect_map_odometry_and_robot(bridge: Bridge) -> None:
     state = EXAMPLES["RobotState"]
     assert isinstance(state, RobotState)
     place = PoseInMap(x=4.0, y=0.0, yaw=0.0, covariance=(0.0,) * 9)
@@ -243,7 +243,7 @@ async def test_the_frames_join_map_and_robot(bridge: Bridge) -> None:
 
 
 async def sees_the_arm(viewer: Viewer) -> None:
-    """The shapes of all links, and the first of them turned a quarter to the left."""
+    """Assert that all links are drawn, and the first one is turned a quarter to the left."""
     await viewer.subscribe("/viz/arm")
     scene = await viewer.message("/viz/arm")
     frames = {dict(fields(entity))[2].decode() for _, entity in fields(scene)}
@@ -256,7 +256,9 @@ async def sees_the_arm(viewer: Viewer) -> None:
     assert (turn[3], turn[4]) == pytest.approx((math.sqrt(0.5), math.sqrt(0.5)))
 
 
-async def test_an_arm_is_drawn_for_viewers_before_and_after_its_model(bridge: Bridge) -> None:
+async def test_an_arm_is_drawn_for_viewers_that_connect_before_and_after_its_model(
+    bridge: Bridge,
+) -> None:
     mjcf = (ROOT / "drivers/gigabrain_drivers/bodies/so101/model.xml").read_text("utf-8")
     joints = (Joint(name="shoulder_pan", position=-math.pi / 2),)
 
@@ -280,13 +282,15 @@ async def test_a_viewer_sees_the_connection_graph(bridge: Bridge) -> None:
     await NameClaim(bridge.robot).acquire()
     await NameClaim(bridge.bus).acquire()
     async with bridge.viewer() as viewer:
-        await viewer.say(op="subscribeConnectionGraph")
+        await viewer.send(op="subscribeConnectionGraph")
         graph = await viewer.connections("robot/scan")
     assert {"name": "robot/scan", "publisherIds": ["driver"]} in graph["publishedTopics"]
     assert {"name": "robot/scan", "subscriberIds": ["foxglove"]} in graph["subscribedTopics"]
 
 
-def test_the_layout_holds_the_topic_and_only_its_owner_can_read_it(tmp_path: Path) -> None:
+def test_the_layout_contains_the_secret_topic_and_only_its_owner_can_read_it(
+    tmp_path: Path,
+) -> None:
     config = FoxgloveConfig(secret=str(tmp_path / "secret"))
     path = tmp_path / "robot.json"
     path.write_text("of before")
@@ -300,7 +304,9 @@ def test_the_layout_holds_the_topic_and_only_its_owner_can_read_it(tmp_path: Pat
         write_layout(config, tmp_path / "none" / "robot.json")
 
 
-def test_the_secret_to_steer_opens_no_page(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_secret_for_steering_is_no_token_of_the_page(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
     topic = topic_to_steer(FoxgloveConfig())
     assert topic_to_steer(FoxgloveConfig()) == topic
@@ -321,7 +327,7 @@ def _panels(place: object) -> list[str]:
     return [*_panels(place["first"]), *_panels(place["second"])]
 
 
-async def test_a_robot_turns_as_a_viewer_steers_and_a_second_bridge_is_refused(
+async def test_a_viewer_steers_a_robot_and_a_second_bridge_is_refused(
     home: Home,
 ) -> None:
     from gigabrain_zenoh.launch.deployment import ROBOT
@@ -353,7 +359,7 @@ async def test_a_robot_turns_as_a_viewer_steers_and_a_second_bridge_is_refused(
                     with contextlib.suppress(TimeoutError):
                         await hold(viewer, LEFT, turns, 2.0)
                         break
-                    await asyncio.sleep(1.0)  # let go of it
+                    await asyncio.sleep(1.0)  # the button is released
         await seen.at_rest()
         second = await home.run(
             "foxglove", "--port", str(port), "--namespace", "other",

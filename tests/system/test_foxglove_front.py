@@ -29,7 +29,7 @@ def refusal(*fields: str) -> str:
         "https://app.foxglove.dev", "https://viewer.example", "HTTPS://VIEWER.example",
     ],
 )  # fmt: skip
-def test_pages_of_this_machine_and_of_known_viewers_get_in(origin: str) -> None:
+def test_pages_of_this_machine_and_of_known_viewers_are_admitted(origin: str) -> None:
     assert refusal(f"Origin: {origin}") == ""
 
 
@@ -46,20 +46,20 @@ def test_pages_of_other_sites_are_refused(origin: str) -> None:
     assert "\x1b" not in refusal(f"Origin: {origin}")
 
 
-def test_programs_name_no_origin_and_get_in_but_must_want_a_websocket() -> None:
+def test_programs_without_an_origin_are_admitted_if_they_request_a_websocket() -> None:
     assert refusal() == ""
     no_socket = HEAD.format("").replace("Upgrade: websocket\r\n", "")
     assert Front((), ("", 0)).refusal(no_socket.encode()) == "400 expected a WebSocket"
 
 
-def test_what_stands_behind_has_an_address_that_differs_each_time() -> None:
+def test_the_inner_server_has_a_new_random_address_each_time() -> None:
     hosts = {hidden_host() for _ in range(10)}
     assert len(hosts) == 10 or hosts == {"127.0.0.1"}
     assert all(host.startswith("127.") for host in hosts)
 
 
 class Talker:
-    """A server that has much to say to all who come."""
+    """A server that sends a lot to every connection."""
 
     def __init__(self) -> None:
         self.there = 0
@@ -95,27 +95,27 @@ def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(access, "STALL_TIMEOUT_S", 1.0)
 
 
-async def first(port: int) -> tuple[bytes, asyncio.StreamWriter]:
-    """Connect as a viewer. Return the first bytes received (at most 20), and the writer."""
+async def connect_and_read(port: int) -> tuple[bytes, asyncio.StreamWriter]:
+    """Connect as a viewer. Return the first bytes (at most 20), and the writer."""
     reader, writer = await asyncio.open_connection("127.0.0.1", port)
     writer.write(HEAD.format("X: y").encode())
     return await reader.read(20), writer
 
 
 @pytest.mark.usefixtures("impatient")
-async def test_of_200_viewers_that_do_not_read_16_are_admitted_and_cut_off(
+async def test_of_200_viewers_that_do_not_read_16_are_admitted_and_then_cut_off(
     talker: tuple[Talker, int, Front],
 ) -> None:
     made, port, stands = talker
-    received = [await first(port) for _ in range(200)]
+    received = [await connect_and_read(port) for _ in range(200)]
     starts = [data[:12] for data, _ in received]
     assert set(starts) == {bytes(12), b"HTTP/1.1 503"}
     assert starts[:16] == [bytes(12)] * 16
     assert made.there <= 16
     async with asyncio.timeout(20):
-        while stands.viewers or made.there:  # noqa: ASYNC110 - until they are cut off
+        while stands.viewers or made.there:  # noqa: ASYNC110 - until all are cut off
             await asyncio.sleep(0.01)
-    data, writer = await first(port)  # a newcomer has a place
+    data, writer = await connect_and_read(port)  # a new viewer is admitted
     assert data == bytes(20)
     for _, each in (*received, (b"", writer)):
         each.transport.abort()
@@ -127,7 +127,7 @@ async def bridge(tmp_path: Path) -> AsyncIterator[Bridge]:
         yield made
 
 
-async def test_another_site_cannot_look_on_through_a_browser(bridge: Bridge) -> None:
+async def test_a_web_page_of_another_site_cannot_connect(bridge: Bridge) -> None:
     url = f"ws://127.0.0.1:{bridge.config.port}"
     with pytest.raises(InvalidStatus) as refused:
         async with connect(url, origin="http://evil.com", subprotocols=["foxglove.sdk.v1"]):  # type: ignore[arg-type, list-item]
@@ -137,12 +137,12 @@ async def test_another_site_cannot_look_on_through_a_browser(bridge: Bridge) -> 
         pass
 
 
-async def test_100_silent_connections_keep_no_viewer_out(
+async def test_100_silent_connections_do_not_block_a_viewer(
     talker: tuple[Talker, int, Front],
 ) -> None:
     _, port, stands = talker
     silent = [await asyncio.open_connection("127.0.0.1", port) for _ in range(100)]
-    data, writer = await first(port)
+    data, writer = await connect_and_read(port)
     assert data == bytes(20)
     assert len(stands._arriving) <= 64
     for each in (*(each for _, each in silent), writer):

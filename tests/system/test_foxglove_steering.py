@@ -28,18 +28,18 @@ async def bridge(tmp_path: Path) -> AsyncIterator[Bridge]:
         yield made
 
 
-async def test_the_teleop_panel_steers_and_a_viewer_that_vanishes_stops(bridge: Bridge) -> None:
+async def test_the_teleop_panel_steers_and_a_lost_viewer_stops_the_robot(bridge: Bridge) -> None:
     topic = topic_to_steer(bridge.config)
     async with bridge.viewer() as viewer:
         await viewer.publish_on(topic)
         await hold(viewer, LEFT, lambda: bridge.turns)
         assert bridge.turns[-1] == 0.5
         await hold(viewer, {"linear_x": 9.0}, lambda: bridge.steered[-1].linear_x)
-        assert bridge.steered[-1].linear_x == 0.26  # no faster than the body can
+        assert bridge.steered[-1].linear_x == 0.26  # limited to the speed of the body
     await until(lambda: bridge.steered[-1].linear_x == 0.0, "a last word")
 
 
-async def test_of_two_viewers_one_steers(bridge: Bridge) -> None:
+async def test_only_one_of_two_viewers_steers(bridge: Bridge) -> None:
     topic = topic_to_steer(bridge.config)
     async with bridge.viewer() as one, bridge.viewer() as two:
         for viewer in (one, two):
@@ -95,7 +95,7 @@ async def test_every_refused_viewer_is_logged_once_however_many_there_are(
         assert refusals() == number
 
 
-async def test_noise_floods_and_vanishing_viewers_disturb_no_other(bridge: Bridge) -> None:
+async def test_noise_floods_and_lost_viewers_do_not_disturb_others(bridge: Bridge) -> None:
     scan = EXAMPLES["LaserScan"]
     assert isinstance(scan, LaserScan)
     bridge.robot.publish(SCAN, scan)
@@ -103,19 +103,20 @@ async def test_noise_floods_and_vanishing_viewers_disturb_no_other(bridge: Bridg
         await viewer.subscribe("/viz/scan")
         with socket.create_connection(("127.0.0.1", bridge.config.port)) as raw:
             raw.sendall(b"\x00\xff" * 500)
-        with contextlib.suppress(ConnectionClosed):  # who does not hear complaints is cut off
+        # a viewer that does not read the errors is cut off
+        with contextlib.suppress(ConnectionClosed):
             async with bridge.viewer() as noisy:
                 await noisy.publish_on(topic_to_steer(bridge.config))
                 for _ in range(300):
                     await noisy.publish(b"\xff")
-                    await noisy.say(op="nonsense")
+                    await noisy.send(op="nonsense")
         for _ in range(5):
             bridge.robot.publish(SCAN, scan)
             await viewer.message("/viz/scan")
     assert bridge.turns == []
 
 
-def test_a_velocity_is_read_as_the_panel_sends_it_and_as_we_do() -> None:
+def test_velocities_in_the_format_of_the_panel_and_in_ours_are_read() -> None:
     assert velocity_of(json.dumps(LEFT).encode()).angular_z == 0.5
     assert velocity_of(b'{"linear_x": 0.2, "linear_y": 0.1}').linear_y == 0.1
     with pytest.raises(ValueError, match="moves in x and y"):

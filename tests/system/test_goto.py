@@ -1,4 +1,4 @@
-"""`gigabrain goto` and its like, with all processes: a robot that explores is sent elsewhere."""
+"""`gigabrain goto` and similar commands, with all processes, on an exploring robot."""
 
 import signal
 from collections.abc import AsyncIterator
@@ -10,27 +10,27 @@ from gigabrain_zenoh.qa.probe import probing
 from gigabrain_zenoh.testing.processes import Home, robot_of
 from gigabrain_zenoh.testing.waiting import until
 
-COMPILING_S = 600.0  # at the very first start
+COMPILE_TIMEOUT_S = 600.0  # the first start compiles
 
 
 @pytest.fixture
 async def home_of_robot(home: Home) -> AsyncIterator[Home]:
-    """A robot that makes a map of the arena; in lock-step, on any machine."""
+    """A robot that maps the arena, in lock-step."""
     demo = home.start("demo", "--headless", "--speed", "3", "--seconds", "3000")
     endpoint = await robot_of(home, demo)
     async with probing(endpoint) as robot:
-        await until(lambda: robot.state.gate.mode == "enabled", "driving", COMPILING_S)
+        await until(lambda: robot.state.gate.mode == "enabled", "driving", COMPILE_TIMEOUT_S)
         yield home
 
 
 @pytest.mark.slow
-async def test_a_robot_that_explores_is_sent_elsewhere_and_says_what_became_of_it(
+async def test_an_exploring_robot_is_sent_elsewhere_and_reports_the_result(
     home_of_robot: Home, tmp_path: Path
 ) -> None:
     home = home_of_robot
     there = await home.run("goto", "0", "0")
-    said = there.out.splitlines()[-1]
-    assert said.startswith("goal-2 has succeeded: at (0.00, 0.00) (position error 0.")
+    last_line = there.out.splitlines()[-1]
+    assert last_line.startswith("goal-2 has succeeded: at (0.00, 0.00) (position error 0.")
     assert there.err == ""
     assert await there.ended() == 0
     half = await home.run("goto", "0.5")
@@ -59,7 +59,7 @@ async def test_a_robot_that_explores_is_sent_elsewhere_and_says_what_became_of_i
     assert await bad.ended() == 2
 
 
-async def test_nobody_who_serves_goals_is_told_apart_from_no_robot(home: Home) -> None:
-    nobody = await home.run("goto", "1", "2")
-    assert nobody.err.startswith("gigabrain: no robot runs here; start one with `gigabrain demo`")
-    assert await nobody.ended() == 1
+async def test_goto_without_a_robot_fails_with_the_remedy(home: Home) -> None:
+    no_robot = await home.run("goto", "1", "2")
+    assert no_robot.err.startswith("gigabrain: no robot runs here; start one with `gigabrain demo`")
+    assert await no_robot.ended() == 1

@@ -1,4 +1,4 @@
-"""Hostile bytes on every key of a driving robot: dropped, counted, and nothing else happens."""
+"""Hostile bytes on every key of a driving robot are dropped and counted, without other effect."""
 
 import json
 import math
@@ -49,7 +49,7 @@ MEGABYTE = 1 << 20
 
 
 def hostile(topic: Topic[Any], chance: random.Random) -> list[bytes]:
-    """Payloads of every evil kind, none of which is a valid message."""
+    """Return payloads of every hostile kind; none is a valid message."""
     name = topic.type.__name__
     whole, good = as_map(name), msgspec.msgpack.encode(EXAMPLES[name])
     missing = [{k: v for k, v in whole.items() if k != field} for field in whole]
@@ -68,7 +68,7 @@ def hostile(topic: Topic[Any], chance: random.Random) -> list[bytes]:
 
 @asynccontextmanager
 async def stranger_at(endpoint: Endpoint) -> AsyncIterator[tuple[ZenohTransport, Bus]]:
-    """Somebody else on the network, who hears the robot's clock as well."""
+    """Connect an unknown client, which follows the robot's clock."""
     transport = await ZenohTransport.open(endpoint)
     bus = Bus(transport, Clock(), "stranger")
     bus.latest(STATE)
@@ -82,7 +82,7 @@ async def test_a_flood_on_every_key_is_dropped_and_counted_and_the_robot_drives_
     home: Home,
 ) -> None:
     path, chance = home.folder / "report.json", random.Random(7)
-    # in lock-step, where time waits for the brain: a stop would be the flood's, not the machine's
+    # in lock-step time waits for the brain, so only the flood could stop the robot
     options = ("--headless", "--speed", "2", "--seconds", "30", "--report", str(path))
     demo = home.start(*AVOID, *options)
     endpoint = await robot_of(home, demo)
@@ -94,19 +94,19 @@ async def test_a_flood_on_every_key_is_dropped_and_counted_and_the_robot_drives_
                 transport.publish(topic, topic.at("stranger"), payload, "")
                 if number % 20 == 0:
                     await robot.ticks(1)
-        await robot.ticks(100)  # the next health of each
+        await robot.ticks(100)  # until the next health of each process
         assert await robot.pids() == pids
         assert (robot.state.gate.mode, robot.state.gate.enables) == ("enabled", enables)
         for key, processes in LISTENERS.items():
             for process in processes:
                 assert robot.health[process].rejected[key] > 0, (key, process)
-        told = Counter(
+        rejected = Counter(
             (record.process, record.data["key"])
             for record in robot.logs
             if record.event == "rejected"
         )
-        assert {("driver", "robot/cmd_vel"), ("control", "robot/teleop")} <= told.keys()
-        assert max(told.values()) == 1
+        assert {("driver", "robot/cmd_vel"), ("control", "robot/teleop")} <= rejected.keys()
+        assert max(rejected.values()) == 1
     assert await demo.ended() == 0
     report = json.loads(path.read_bytes())
     assert report["rejected_messages"] > 500
@@ -122,7 +122,7 @@ def deployment(shared_home: Home) -> Path:
 
 @pytest.fixture
 async def robot(deployment: Path) -> AsyncIterator[Probe]:
-    """The robot, driving by itself."""
+    """The robot, which drives autonomously."""
     async with probing(endpoint_of(deployment)) as onlooker:
         await until(lambda: onlooker.state.gate.mode == "enabled", "driving")
         yield onlooker
@@ -134,7 +134,7 @@ async def robot(deployment: Path) -> AsyncIterator[Probe]:
     [b"\xc1", b"{", b'{"take": 1, "source": "x"}', b'{"estop_generation": NaN}', b"\x80" * 70_000],
     ids=["no MessagePack", "half JSON", "a number for a boolean", "NaN", "70 kB"],
 )
-async def test_a_request_that_is_none_is_refused_in_words(
+async def test_an_invalid_request_is_refused_with_a_reason(
     robot: Probe, deployment: Path, service: Service[Any, Any], payload: bytes
 ) -> None:
     async with stranger_at(endpoint_of(deployment)) as (transport, _):
@@ -147,12 +147,12 @@ async def test_a_request_that_is_none_is_refused_in_words(
     assert robot.state.gate.estop_generation == 0
 
 
-async def test_nobody_else_can_drive_a_body_that_has_a_commander(
+async def test_a_stranger_cannot_drive_a_body_that_has_a_commander(
     robot: Probe, deployment: Path
 ) -> None:
     before = (await robot.truth())["ticks"]
     async with stranger_at(endpoint_of(deployment)) as (_, bus):
-        for _ in range(50):  # the right boot and the newest tick, at full speed backwards
+        for _ in range(50):  # full speed backwards, with the right boot and newest tick
             bus.publish(CMD_VEL, CmdVel(linear_x=-0.26, source="stranger"))
             await robot.ticks(1)
     slowest = min(s.velocity.linear_x for s in robot.states if s.tick > before)

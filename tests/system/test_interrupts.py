@@ -31,9 +31,9 @@ os._exit(code or 0)
 
 
 def ended(body: str, sigint: object = signal.default_int_handler) -> tuple[int, str, str]:
-    """The exit code, the output and the complaints of a program whose `main` has this body."""
+    """Run a program whose `main` has this body; return its exit code, output and errors."""
     lines = "".join(f"    {line}\n" for line in body.strip().splitlines())
-    # a child inherits what is ignored, SIGHUP of a suite under nohup as well
+    # a child inherits ignored signals, such as SIGHUP under nohup
     wanted = {signal.SIGINT: sigint, signal.SIGHUP: signal.SIG_DFL}
     before = {number: signal.signal(number, action) for number, action in wanted.items()}  # type: ignore[arg-type]
     try:
@@ -46,7 +46,7 @@ def ended(body: str, sigint: object = signal.default_int_handler) -> tuple[int, 
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
-def test_a_signal_that_another_thread_gets_ends_a_sleeping_event_loop(number: int) -> None:
+def test_a_signal_received_by_another_thread_ends_a_sleeping_event_loop(number: int) -> None:
     body = f"""
 threading.Thread(target=elsewhere, args=({number},), daemon=True).start()
 run_async(asyncio.sleep(3600))
@@ -54,7 +54,7 @@ run_async(asyncio.sleep(3600))
     assert ended(body) == (128 + number, "in good order\n", "")
 
 
-def test_a_signal_that_another_thread_gets_ends_a_sleeping_program() -> None:
+def test_a_signal_received_by_another_thread_ends_a_sleeping_program() -> None:
     body = """
 threading.Thread(target=elsewhere, args=(2,), daemon=True).start()
 time.sleep(3600)
@@ -62,7 +62,7 @@ time.sleep(3600)
     assert ended(body) == (130, "in good order\n", "")
 
 
-def test_sigint_counts_where_a_shell_has_had_it_ignored() -> None:
+def test_sigint_works_although_a_shell_ignored_it() -> None:
     body = """
 os.kill(os.getpid(), 2)
 time.sleep(3600)
@@ -70,7 +70,7 @@ time.sleep(3600)
     assert ended(body, signal.SIG_IGN) == (130, "in good order\n", "")
 
 
-def test_a_signal_that_a_destructor_swallows_comes_again() -> None:
+def test_a_signal_swallowed_by_a_destructor_is_raised_again() -> None:
     body = """
 class Swallows:
     def __del__(self):
@@ -82,7 +82,7 @@ time.sleep(3600)
     assert ended(body) == (143, "in good order\n", "")
 
 
-def test_a_signal_before_the_loop_runs_cancels_what_it_runs() -> None:
+def test_a_signal_before_the_loop_runs_cancels_its_main_task() -> None:
     body = """
 with interrupts.reacting(None):
     os.kill(os.getpid(), 15)
@@ -91,7 +91,7 @@ with interrupts.reacting(None):
     assert ended(body) == (143, "in good order\n", "")
 
 
-def test_a_cancelled_command_cleans_up_and_is_not_cut_short_by_a_second_signal() -> None:
+def test_a_second_signal_does_not_interrupt_the_clean_up() -> None:
     body = """
 async def work():
     try:
@@ -106,7 +106,7 @@ run_async(work())
     assert ended(body) == (130, "cleaned up\nin good order\n", "")
 
 
-def test_what_a_signal_stops_in_good_order_has_an_exit_code_of_its_own() -> None:
+def test_a_command_stopped_by_a_signal_has_its_own_exit_code() -> None:
     body = """
 async def work():
     with stop_signals(0.3) as stop:
@@ -122,11 +122,11 @@ return run_async(work())
 @pytest.mark.parametrize(
     "stuck",
     [
-        "await asyncio.to_thread(time.sleep, 3600)",  # the loop waits for its threads
+        "await asyncio.to_thread(time.sleep, 3600)",  # the loop waits for this thread
         "time.sleep(3600)",  # in a callback
     ],
 )
-def test_what_does_not_end_is_ended_by_force(stuck: str) -> None:
+def test_a_program_that_does_not_end_is_killed(stuck: str) -> None:
     body = f"""
 async def work():
     threading.Timer(0.1, os.kill, (os.getpid(), 15)).start()

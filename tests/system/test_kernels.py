@@ -14,7 +14,7 @@ pytest.importorskip("numba")
 from gigabrain_zenoh.kernels import cache as kernels
 
 
-def test_a_change_in_any_source_with_kernels_asks_for_a_folder_of_its_own(
+def test_a_change_in_any_source_with_kernels_gets_a_new_cache_folder(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
@@ -26,11 +26,11 @@ def test_a_change_in_any_source_with_kernels_asks_for_a_folder_of_its_own(
     assert first.parent == tmp_path / "gigabrain"
     assert kernels.cache_folder() == first
     (tmp_path / "mapping" / "one.py").write_text("x = 2")
-    kernels.digest.cache_clear()  # as in another process
+    kernels.digest.cache_clear()  # as in a new process
     assert kernels.cache_folder() != first
 
 
-def test_a_second_checkout_is_not_taken_for_compiled(
+def test_a_second_checkout_does_not_count_as_compiled(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
@@ -42,12 +42,12 @@ def test_a_second_checkout_is_not_taken_for_compiled(
         source.write_text("x = 1")
         os.utime(source, (1, 1))
         folders.append(kernels.cache_folder())
-    os.utime(source, (2, 2))  # numba takes it for another file
+    os.utime(source, (2, 2))  # another file for numba
     kernels.digest.cache_clear()
     assert len({*folders, kernels.cache_folder()}) == 3
 
 
-def test_where_nothing_can_be_written_it_is_compiled_all_the_same(tmp_path: Path) -> None:
+def test_without_a_writable_cache_kernels_are_still_compiled(tmp_path: Path) -> None:
     no_folder = tmp_path / "file"
     no_folder.write_text("")
     environment = {

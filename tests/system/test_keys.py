@@ -1,9 +1,9 @@
-"""Keys on disk: how they are made, what is refused, and what the refusal says."""
+"""Keys on disk: the commands that make and list them."""
 
 from gigabrain_zenoh.testing.processes import Home
 
 
-async def test_keys_are_made_and_listed_by_command(home: Home) -> None:
+async def test_keys_are_issued_and_listed_by_command(home: Home) -> None:
     folder = str(home.folder / "fleet")
     new = await home.run("keys", "new", "home", "--dir", folder)
     assert new.out.splitlines()[-1] == (

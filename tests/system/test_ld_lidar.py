@@ -25,7 +25,7 @@ def options(folder: Path) -> ScanOptions:
     return ScanOptions(driver="ld19", port=str(folder / "scan"))
 
 
-def test_a_bin_holds_its_nearest_sample_inf_without_a_return_and_nan_without_a_sample() -> None:
+def test_a_bin_has_its_nearest_sample_inf_without_return_or_nan_without_sample() -> None:
     eighth = math.tau / 8
     angles = [0.1, -0.1, eighth, 2 * eighth, 3 * eighth, 4 * eighth, 5 * eighth]
     scan = bin_scan(SMALL, angles, [1.0, 0.9, math.inf, 9.0, 0.02, math.nan, -0.0])
@@ -48,7 +48,7 @@ def test_clockwise_degrees_become_counter_clockwise_bins() -> None:
     assert (got[0], got[6], got[2]) == (1.0, 2.0, 2.5)
 
 
-def test_a_turn_whose_start_was_not_seen_is_no_scan() -> None:
+def test_an_incomplete_turn_is_no_scan() -> None:
     turn = SampleBuffer(SMALL)
     turn.add_samples([90.0], [2000], None, 0)
 
@@ -56,7 +56,7 @@ def test_a_turn_whose_start_was_not_seen_is_no_scan() -> None:
 
 
 @pytest.mark.parametrize("took_ms", [20, 301])
-def test_a_turn_that_came_too_fast_or_too_slowly_to_be_true_is_no_scan(took_ms: int) -> None:
+def test_a_turn_of_implausible_duration_is_no_scan(took_ms: int) -> None:
     turn = SampleBuffer(SMALL)
     for n in range(5):
         turn.add_samples([30.0 * n], [1000], None if n else 0, n * took_ms * MS // 5)
@@ -64,7 +64,7 @@ def test_a_turn_that_came_too_fast_or_too_slowly_to_be_true_is_no_scan(took_ms: 
     assert turn.add_samples([0.0], [1000], 0, took_ms * MS) is None
 
 
-def test_what_came_before_a_turn_of_silence_is_forgotten() -> None:
+def test_samples_before_a_long_silence_are_dropped() -> None:
     turn = SampleBuffer(SMALL)
     turn.add_samples([0.0], [1000], 0, 0)
     turn.add_samples([200.0], [1000], None, 101 * MS)
@@ -110,12 +110,12 @@ def test_a_scan_of_the_emulated_lidar_is_the_scan_of_the_simulation() -> None:
         source.received(b"".join(wire.sent))
         wire.sent.clear()
 
-    assert len(scans) == 3  # the first turn was not seen to begin, the fifth not to end
+    assert len(scans) == 3  # the first and the last turn are incomplete
     assert agree(scans[-1], truth()) > 0.97
     assert not np.isnan(scans[-1].ranges_m).any()
 
 
-async def test_scans_come_over_a_pty_and_again_after_an_unplugged_cable(tmp_path: Path) -> None:
+async def test_scans_arrive_over_a_pty_and_again_after_it_was_unplugged(tmp_path: Path) -> None:
     async with (
         emulated(LdDevice, options(tmp_path)) as station,
         Listener(Ld19(options(tmp_path), LIDAR, Clock())) as listener,
@@ -136,7 +136,7 @@ async def test_scans_come_over_a_pty_and_again_after_an_unplugged_cable(tmp_path
         await until(lambda: not listener.source.problem)
 
 
-async def test_silence_is_reported_in_one_line_and_ends_by_itself(tmp_path: Path) -> None:
+async def test_silence_is_reported_in_one_line_until_data_returns(tmp_path: Path) -> None:
     async with (
         emulated(LdDevice, options(tmp_path)) as station,
         Listener(Ld19(options(tmp_path), LIDAR, Clock())) as listener,
@@ -148,7 +148,7 @@ async def test_silence_is_reported_in_one_line_and_ends_by_itself(tmp_path: Path
         await listener.more(1)
 
 
-async def test_bit_errors_and_half_frames_cost_frames_and_nothing_else(tmp_path: Path) -> None:
+async def test_bit_errors_and_half_frames_only_lose_frames(tmp_path: Path) -> None:
     async with (
         emulated(LdDevice, options(tmp_path)) as station,
         Listener(Ld19(options(tmp_path), LIDAR, Clock())) as listener,
@@ -164,7 +164,7 @@ async def test_bit_errors_and_half_frames_cost_frames_and_nothing_else(tmp_path:
             assert agree(scan, real) > 0.97 - missing / 360
 
 
-async def test_an_ld19_that_was_left_out_says_nothing_comes(tmp_path: Path) -> None:
+async def test_a_missing_ld19_is_reported_as_silent(tmp_path: Path) -> None:
     async with emulated(LdDevice, options(tmp_path)) as station:
         station.set(Faults(silence=True))
         async with Listener(Ld19(options(tmp_path), LIDAR, Clock())) as listener:

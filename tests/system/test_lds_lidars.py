@@ -1,4 +1,4 @@
-"""LDS-01, LDS-02 and LDS-03 as a body carries them: vendors' corrections, emulated rooms, ptys."""
+"""LDS-01, LDS-02 and LDS-03: the vendors' corrections, emulated scans, ptys."""
 
 import math
 from pathlib import Path
@@ -48,7 +48,7 @@ def scans_of(source: SerialSource, clock: FakeClock, pieces: list[bytes]) -> lis
     return found
 
 
-def test_lds01s_last_sample_looks_ahead_and_the_ones_before_to_the_right() -> None:
+def test_the_last_lds01_sample_points_ahead_and_earlier_ones_to_the_right() -> None:
     def packet(number: int) -> lds01.Lds01Packet:
         first = 6 * number
         return lds01.Lds01Packet(number, 300.0, (9,) * 6, tuple(range(1000 + first, 1006 + first)))
@@ -67,19 +67,21 @@ def test_lds01s_last_sample_looks_ahead_and_the_ones_before_to_the_right() -> No
     ("distance", "seen"),
     [(1000, (-5.6258, 1010.77)), (200, (-1.0300, 205.93)), (8000, (-6.6522, 8060.16))],
 )
-def test_lds02_is_corrected_as_the_vendor_does(distance: int, seen: tuple[float, float]) -> None:
+def test_lds02_distances_are_corrected_as_by_the_vendor(
+    distance: int, seen: tuple[float, float]
+) -> None:
     angles, distances = seen_from_axis(np.array([0.0, 90.0]), np.array([distance, distance]))
     assert angles == pytest.approx([seen[0], 90 + seen[0]], abs=0.01)
     assert distances == pytest.approx([seen[1]] * 2, abs=0.01)
 
 
-def test_no_return_is_left_where_it_is() -> None:
+def test_samples_without_return_are_not_corrected() -> None:
     angles, distances = seen_from_axis(np.array([12.0]), np.array([0.0]))
     assert (angles, distances) == ([12.0], [0.0])
 
 
 @pytest.mark.parametrize("distance", [200.0, 1000.0, 8000.0])
-def test_the_emulated_lens_is_the_corrections_other_side(distance: float) -> None:
+def test_the_emulated_lens_is_the_inverse_of_the_correction(distance: float) -> None:
     _, distances = seen_from_axis(np.array([0.0]), np.array([lens_distance(distance)]))
     assert distances == pytest.approx([distance])
 
@@ -104,7 +106,7 @@ def test_lds02_frames_are_ld_frames_with_the_correction() -> None:
         (lds03.Lds03Sample(0.0, 151, 0, False), 151.0),
     ],
 )
-def test_lds03_samples_that_are_near_and_weak_are_not_trusted(
+def test_near_and_weak_lds03_samples_are_ignored(
     sample: lds03.Lds03Sample, distance: float
 ) -> None:
     assert trusted(sample) == pytest.approx(distance, nan_ok=True)
@@ -131,7 +133,7 @@ def test_an_emulated_scan_is_the_simulations(
 
 
 @each
-async def test_scans_come_over_a_pty_and_again_after_an_unplugged_cable(
+async def test_scans_arrive_over_a_pty_and_again_after_it_was_unplugged(
     tmp_path: Path, source: type[SerialSource], device: type[Device], lidar: Lidar
 ) -> None:
     async with (
@@ -150,7 +152,7 @@ async def test_scans_come_over_a_pty_and_again_after_an_unplugged_cable(
 
 
 @each
-async def test_noise_costs_frames_and_nothing_else(
+async def test_noise_only_loses_frames(
     tmp_path: Path, source: type[SerialSource], device: type[Device], lidar: Lidar
 ) -> None:
     async with (
@@ -167,7 +169,7 @@ async def test_noise_costs_frames_and_nothing_else(
 @pytest.mark.parametrize(
     ("source", "device"), [(Lds01, Lds01Device), (Lds03, Lds03Device)], ids=["lds01", "lds03"]
 )
-async def test_a_lidar_that_was_switched_on_later_is_started_again(
+async def test_a_lidar_that_was_rebooted_is_started_again(
     tmp_path: Path, source: type[SerialSource], device: type[Device]
 ) -> None:
     async with (
@@ -179,7 +181,7 @@ async def test_a_lidar_that_was_switched_on_later_is_started_again(
         await listener.more(2)
 
 
-async def test_a_lidar_is_brought_to_rest_when_its_port_is_closed(tmp_path: Path) -> None:
+async def test_closing_the_port_stops_the_lidar_motor(tmp_path: Path) -> None:
     async with emulated(Lds01Device, options(tmp_path)) as station:
         async with Listener(Lds01(options(tmp_path), SLOW, Clock())) as listener:
             await listener.more(1)

@@ -43,13 +43,13 @@ async def arm(shared_home: Home, demo: CommandProcess) -> AsyncIterator[Probe]:
 
 
 class Leader:
-    """The leader, which the test moves by hand, and the command that reads it."""
+    """The leader arm, which the test moves, and the command that reads it."""
 
     def __init__(self, device: FeetechArm, body: FreeArm, port: Path) -> None:
         self.device, self.body, self.port = device, body, port
 
     async def move(self, **positions: float) -> None:
-        """Bring joints somewhere at 1 rad/s."""
+        """Move joints to positions at 1 rad/s."""
         moving = {self.body.free[name]: place for name, place in positions.items()}
         while any(abs(joint.position - place) > 1e-6 for joint, place in moving.items()):
             for joint, place in moving.items():
@@ -58,7 +58,7 @@ class Leader:
             await asyncio.sleep(TEN_MS)
 
     async def swing(self, name: str, one: float, other: float) -> None:
-        """Move a joint to and fro without end."""
+        """Move a joint to and fro for ever."""
         while True:
             await self.move(**{name: one})
             await self.move(**{name: other})
@@ -71,12 +71,12 @@ class Leader:
 @asynccontextmanager
 async def leader_at(port: Path) -> AsyncIterator[Leader]:
     async with emulated_arm(port) as (device, body):
-        device.reset()  # plugged in again: its motors are off
+        device.reset()  # its motors are off after a power-up
         yield Leader(device, body, port)
 
 
 async def reads(leader: LeaderArm, name: str, position: float) -> dict[str, float]:
-    """Wait until a joint is somewhere; return the posture then."""
+    """Wait until a joint reads `position` [rad]; return the posture then."""
     for _ in range(6000):
         found = dict(await leader.read())
         if abs(found[name] - position) < NEAR:
@@ -89,8 +89,8 @@ def sent(arm: Probe, name: str) -> float:
     return arm.state.joints_sent[NAMES.index(name)]
 
 
-def fastest(ways: dict[int, Floats]) -> float:
-    """Return the greatest speed of a joint [rad/s] over 0.2 s or more: commands come jerkily."""
+def max_joint_speed(ways: dict[int, Floats]) -> float:
+    """Return the maximum speed of a joint [rad/s], averaged over at least 0.2 s."""
     speeds = [0.0]
     for tick, begin in ways.items():
         end = next((later for later in sorted(ways) if later >= tick + 10), None)
@@ -100,7 +100,7 @@ def fastest(ways: dict[int, Floats]) -> float:
 
 
 @pytest.mark.slow
-async def test_an_arm_goes_slowly_to_the_leader_s_posture_then_follows_it_and_is_recorded(
+async def test_an_arm_goes_slowly_to_the_posture_of_its_leader_then_follows_it(
     shared_home: Home, arm: Probe, tmp_path: Path
 ) -> None:
     bag = tmp_path / "led.mcap"
@@ -115,7 +115,7 @@ async def test_an_arm_goes_slowly_to_the_leader_s_posture_then_follows_it_and_is
             ways[arm.state.tick] = np.array([joint.position for joint in arm.state.joints[:5]])
             await asyncio.sleep(TEN_MS)
         assert "slowly to the leader's posture: shoulder_pan has" in command.out
-        assert fastest(ways) < 1.3  # [rad/s]; 45 degrees are 0.79
+        assert max_joint_speed(ways) < 1.3  # [rad/s]; 45 degrees are 0.79
         assert arm.state.gate.commander.endswith("-leader")
         await leader.move(shoulder_pan=-0.3, wrist_roll=0.5, gripper=0.5)
         await until(lambda: abs(sent(arm, "shoulder_pan") + 0.3) < NEAR, "it follows")
@@ -143,7 +143,7 @@ async def test_an_arm_goes_slowly_to_the_leader_s_posture_then_follows_it_and_is
     assert observed[-1] == pytest.approx(action[-1], abs=4.0)
 
 
-async def test_a_leader_that_is_unplugged_leaves_the_follower_where_it_is(
+async def test_an_unplugged_leader_leaves_the_follower_at_rest(
     shared_home: Home, arm: Probe, tmp_path: Path
 ) -> None:
     async with leader_at(tmp_path / "leader") as leader:
@@ -164,7 +164,7 @@ async def test_a_leader_that_is_unplugged_leaves_the_follower_where_it_is(
 
 
 @pytest.mark.slow
-async def test_an_estop_ends_it_and_the_arm_is_held(
+async def test_an_estop_ends_following_and_the_arm_is_held(
     shared_home: Home, arm: Probe, tmp_path: Path
 ) -> None:
     async with leader_at(tmp_path / "leader") as leader:
@@ -187,7 +187,7 @@ async def test_an_estop_ends_it_and_the_arm_is_held(
 
 
 @pytest.mark.slow
-async def test_a_leader_of_which_a_servo_is_missing_moves_nothing(
+async def test_a_leader_with_a_missing_servo_moves_nothing(
     shared_home: Home, arm: Probe, tmp_path: Path
 ) -> None:
     before = arm.state.joints_sent
@@ -201,7 +201,7 @@ async def test_a_leader_of_which_a_servo_is_missing_moves_nothing(
 
 
 @pytest.mark.slow
-async def test_the_port_of_the_follower_is_none_for_a_leader(
+async def test_the_port_of_the_follower_is_refused_as_leader(
     shared_home: Home, tmp_path: Path
 ) -> None:
     port = tmp_path / "base"
@@ -213,7 +213,7 @@ async def test_the_port_of_the_follower_is_none_for_a_leader(
         await until(lambda: not follower.problem)
 
 
-async def test_the_emulator_s_limp_arm_is_moved_by_what_is_typed(
+async def test_the_limp_arm_of_the_emulator_is_moved_by_typed_commands(
     shared_home: Home, tmp_path: Path
 ) -> None:
     command = (*GIGABRAIN, "emulate", "so101", "--ports", str(tmp_path), "--world", "arena")

@@ -1,4 +1,4 @@
-"""A dataset of ours is examined by lerobot-doctor, in an environment of its own."""
+"""lerobot-doctor examines one of our datasets, in a separate environment."""
 
 import math
 import subprocess
@@ -21,7 +21,7 @@ DOCTOR = "lerobot-doctor==0.2.0"
 
 
 def winding(states: int) -> Iterator[tuple[int, str, bytes]]:
-    """Yield a drive in which all values change: states, commands and scans."""
+    """Yield states, commands and scans of a drive in which all values change."""
     for seq in range(1, states + 1):
         seconds = seq / 50
         speeds = 0.2 * math.sin(seconds), 0.1 * math.cos(1.3 * seconds), 0.5 * math.sin(seconds / 2)
@@ -40,7 +40,7 @@ def winding(states: int) -> Iterator[tuple[int, str, bytes]]:
         yield seq * TICK_NS, "robot/state", codec.encode(state)
 
 
-def test_the_doctor_finds_nothing_to_mend(tmp_path: Path) -> None:
+def test_lerobot_doctor_finds_no_fault_in_our_dataset(tmp_path: Path) -> None:
     path, folder = tmp_path / "a.mcap", tmp_path / "dataset"
     ticks = range(5, 1001, 5)
     write(path, winding(1000), pictures(ticks), pictures(ticks, "robot/depth/front"))

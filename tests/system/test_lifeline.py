@@ -17,15 +17,15 @@ def lifeline_exit(code: str, variable: str | None) -> int:
     return subprocess.run([sys.executable, "-c", CHILD + code], env=env, check=False).returncode
 
 
-def test_a_child_whose_supervisor_has_died_before_it_could_ask_ends() -> None:
+def test_a_child_ends_if_its_supervisor_died_before_its_start() -> None:
     assert lifeline_exit("lifeline.die_with_supervisor(); sys.exit(7)", "1") == -9
 
 
 @pytest.mark.parametrize("variable", [None, "", "nonsense"])
-def test_a_process_without_supervisor_lives_as_long_as_it_likes(variable: str | None) -> None:
+def test_a_process_without_a_supervisor_is_not_ended(variable: str | None) -> None:
     assert lifeline_exit("lifeline.die_with_supervisor(); sys.exit(7)", variable) == 7
 
 
-def test_the_lifeline_is_not_handed_on_to_grandchildren() -> None:
+def test_grandchildren_do_not_inherit_the_lifeline() -> None:
     code = "lifeline.die_with_supervisor(); sys.exit('GIGABRAIN_SUPERVISOR' in os.environ)"
     assert lifeline_exit(code, str(os.getpid())) == 0

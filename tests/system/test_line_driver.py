@@ -1,4 +1,4 @@
-"""A body without code on a real pty: it obeys, stops, comes back, and never with old bytes."""
+"""A body driven by text templates, on a real pty: it obeys, stops, and never gets old bytes."""
 
 import asyncio
 import math
@@ -19,7 +19,7 @@ STARTED = BARE.replace(
 )
 
 
-async def test_it_obeys_and_reports_what_its_wheels_did(tmp_path: Path) -> None:
+async def test_it_drives_as_commanded_and_reports_its_motion(tmp_path: Path) -> None:
     async with bench(tmp_path) as it:
         await it.drive_until(
             lambda state: it.body.commanded == (0.3, 0.0, 0.6)
@@ -36,7 +36,7 @@ async def test_it_obeys_and_reports_what_its_wheels_did(tmp_path: Path) -> None:
         assert state.link.errors == 0
 
 
-async def test_what_it_returns_is_what_was_written(tmp_path: Path) -> None:
+async def test_it_returns_the_written_velocity(tmp_path: Path) -> None:
     async with bench(tmp_path) as it:
         sent = await it.driver.set_base_velocity(0.12345, 0.3, 9.0)
         assert sent == Velocity(linear_x=0.123, linear_y=0.0, angular_z=1.2)
@@ -44,7 +44,7 @@ async def test_what_it_returns_is_what_was_written(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
-async def test_what_is_no_number_is_zero_for_all(tmp_path: Path, bad: float) -> None:
+async def test_nan_in_one_axis_sets_all_axes_to_zero(tmp_path: Path, bad: float) -> None:
     async with bench(tmp_path) as it:
         await it.driver.set_base_velocity(0.2, 0.0, 0.0)
         assert await it.driver.set_base_velocity(0.2, 0.0, bad) == ZERO
@@ -52,7 +52,7 @@ async def test_what_is_no_number_is_zero_for_all(tmp_path: Path, bad: float) -> 
 
 
 @pytest.mark.parametrize("text", [BARE, STARTED])
-async def test_nothing_is_written_before_the_body_was_heard_and_then_zero(
+async def test_it_writes_nothing_until_the_body_reports_and_then_zero(
     tmp_path: Path, text: str
 ) -> None:
     async with bench(tmp_path, text, plugged=False) as it:
@@ -69,17 +69,19 @@ async def test_nothing_is_written_before_the_body_was_heard_and_then_zero(
         assert (await it.driver.set_base_velocity(0.2, 0.0, 0.0)).linear_x == 0.2
 
 
-async def test_a_silent_commander_leaves_the_line_silent_and_the_firmware_stops(
+async def test_without_commands_the_line_is_silent_and_the_firmware_stops(
     tmp_path: Path,
 ) -> None:
     async with bench(tmp_path) as it:
         await it.drive(0.1, 0.2)
         before = len(it.firmware.executed)
         await until(lambda: it.body.commanded == (0.0, 0.0, 0.0))
-        assert len(it.firmware.executed) <= before + 1  # by itself, not by a command
+        assert len(it.firmware.executed) <= before + 1  # the firmware stops it, not a command
 
 
-async def test_an_unplugged_body_is_lost_at_once_and_comes_back_with_zero(tmp_path: Path) -> None:
+async def test_an_unplugged_body_is_lost_at_once_and_gets_zero_when_it_returns(
+    tmp_path: Path,
+) -> None:
     async with bench(tmp_path) as it:
         await it.drive(0.1, 0.2)
         it.station.set(Faults(unplugged=True))
@@ -96,7 +98,7 @@ async def test_an_unplugged_body_is_lost_at_once_and_comes_back_with_zero(tmp_pa
 
 
 @pytest.mark.parametrize("fault", [Faults(silence=True), Faults(frozen=True)])
-async def test_a_body_that_falls_silent_is_lost_although_its_port_is_there(
+async def test_a_silent_body_is_lost_although_its_port_exists(
     tmp_path: Path, fault: Faults
 ) -> None:
     async with bench(tmp_path) as it:
@@ -107,7 +109,7 @@ async def test_a_body_that_falls_silent_is_lost_although_its_port_is_there(
         await it.until_connected()
 
 
-async def test_garbage_and_half_lines_are_counted_and_nothing_comes_of_them(
+async def test_garbage_and_half_lines_are_counted_and_have_no_effect(
     tmp_path: Path,
 ) -> None:
     async with bench(tmp_path) as it:
@@ -126,11 +128,11 @@ async def test_a_reboot_does_not_move_the_pose(tmp_path: Path) -> None:
         before = (await it.at_rest()).pose.x
         it.station.set(Faults(reboot=True))
         await it.until_connected(False)
-        it.station.set(NO_FAULTS)  # banner, then counters from zero
+        it.station.set(NO_FAULTS)  # banner, then counters restart at zero
         await it.until_connected()
         state = await it.driver.read_state()
         assert state.pose.x == pytest.approx(before, abs=0.005)
-        assert (state.link.errors, state.velocity.linear_x) == (2, 0.0)  # two lines of banner
+        assert (state.link.errors, state.velocity.linear_x) == (2, 0.0)  # two banner lines
 
 
 async def test_a_board_that_restarts_behind_its_port_is_started_again(tmp_path: Path) -> None:
@@ -143,7 +145,7 @@ async def test_a_board_that_restarts_behind_its_port_is_started_again(tmp_path: 
         await it.drive_until(lambda _: it.body.commanded == (0.2, 0.0, 0.0), 0.2)
 
 
-async def test_a_brown_out_switches_the_body_off_and_it_comes_back_at_rest(tmp_path: Path) -> None:
+async def test_after_a_brown_out_the_body_is_at_rest(tmp_path: Path) -> None:
     async with bench(tmp_path) as it:
         await it.drive(0.1, 0.2)
         it.station.set(Faults(brown_out=6.0))
@@ -163,7 +165,7 @@ async def test_flags_are_logged_once_and_bumpers_reported(
         await it.drive(0.1, 0.0)
         caplog.clear()
         it.body.bumper = True
-        # and nobody commands: the firmware raises `watchdog`
+        # without commands the firmware sets `watchdog`
         await it.reported(lambda _: "the firmware reports: watchdog" in caplog.messages)
         await it.reported(lambda state: state.bumpers == (True, False))
         await asyncio.sleep(0.1)
@@ -175,7 +177,7 @@ async def test_flags_are_logged_once_and_bumpers_reported(
         assert not any("bumper" in text for text in caplog.messages)
 
 
-async def test_a_loss_is_said_once_with_the_reason_and_its_end_once(
+async def test_a_loss_and_its_end_are_logged_once_each(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     caplog.set_level("INFO", "gigabrain_drivers.bodies.line.driver")
@@ -192,7 +194,7 @@ async def test_a_loss_is_said_once_with_the_reason_and_its_end_once(
         assert "reports again" in caplog.text
 
 
-async def test_an_unchanged_command_is_repeated_at_its_rate_and_a_new_one_goes_at_once(
+async def test_unchanged_commands_are_repeated_at_a_rate_and_new_ones_sent_at_once(
     tmp_path: Path,
 ) -> None:
     async with bench(tmp_path) as it:
@@ -208,7 +210,7 @@ async def test_an_unchanged_command_is_repeated_at_its_rate_and_a_new_one_goes_a
         assert 3 <= len(written) <= 7
 
 
-async def test_start_and_stop_strings_frame_the_motion(tmp_path: Path) -> None:
+async def test_start_and_stop_strings_are_sent_around_the_motion(tmp_path: Path) -> None:
     async with bench(tmp_path, STARTED) as it:
         written: list[bytes] = []
         it.driver.link.trace = lambda way, data: written.append(data) if way == "tx" else None
@@ -235,7 +237,7 @@ async def test_a_body_that_was_never_moved_is_never_started(tmp_path: Path) -> N
         assert set(written) <= {b"V,0.000,0.000\n"}
 
 
-async def test_a_started_body_is_stopped_with_its_string_also_after_its_cable_was_out(
+async def test_a_started_body_gets_its_stop_string_also_after_a_reconnection(
     tmp_path: Path,
 ) -> None:
     async with bench(tmp_path, STARTED) as it:
@@ -254,7 +256,7 @@ async def test_a_started_body_is_stopped_with_its_string_also_after_its_cable_wa
 WHEELED = BARE.replace("V,{linear_x:.3f},{angular_z:.3f}", "W,{wheel_left:.1f},{wheel_right:.1f}")
 
 
-async def test_what_is_written_for_wheels_is_returned_as_the_body_then_goes(tmp_path: Path) -> None:
+async def test_rounded_wheel_speeds_are_returned_as_the_resulting_velocity(tmp_path: Path) -> None:
     async with bench(tmp_path, WHEELED) as it:
         sent = await it.driver.set_base_velocity(0.1, 0.0, 0.5)
         # (0.1 -+ 0.5 * 0.25) / 0.08 = -0.31 and 2.81 rad/s
@@ -275,7 +277,7 @@ async def test_stop_and_close_work_in_any_state(tmp_path: Path) -> None:
             await it.driver.set_base_velocity(0.1, 0.0, 0.0)
 
 
-async def test_auto_finds_the_port_from_which_right_lines_come(
+async def test_auto_finds_the_port_that_sends_valid_lines(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     paths = [str(tmp_path / "nothing"), str(tmp_path / "base")]

@@ -1,4 +1,4 @@
-"""The chaos proxy for bodies' lines: a pty in front of a pty, and a folder of ports."""
+"""The chaos proxy for serial lines: a pty in front of a pty, and a folder of ports."""
 
 import asyncio
 import os
@@ -17,7 +17,7 @@ from gigabrain_zenoh.testing.waiting import until
 
 
 class Line:
-    """A device, the proxy in front of it, and a host that has opened the proxy."""
+    """A device, the proxy in front of it, and a host that opened the proxy."""
 
     def __init__(self, folder: Path) -> None:
         self.device = Pty(folder / "device")
@@ -46,7 +46,7 @@ async def test_a_calm_line_changes_no_byte(line: Line) -> None:
     assert (bytes(line.up), bytes(line.down)) == (bytes(range(256)), b"\x00\n\r\xff\x11\x13")
 
 
-async def test_what_is_sent_into_a_hole_is_lost(line: Line) -> None:
+async def test_bytes_sent_into_a_hole_are_lost(line: Line) -> None:
     line.proxy.set(Chaos(hole=True), "up")
     line.host.write(b"lost")
     line.device.write(b"heard")
@@ -57,7 +57,7 @@ async def test_what_is_sent_into_a_hole_is_lost(line: Line) -> None:
     assert bytes(line.up) == b"found"
 
 
-async def test_bits_are_flipped_and_pieces_vanish_as_often_as_is_said(line: Line) -> None:
+async def test_bit_errors_and_losses_occur_at_the_set_rates(line: Line) -> None:
     line.proxy.set(Chaos(corrupt=1.0), "down")
     line.proxy.set(Chaos(drop=1.0), "up")
     line.device.write(bytes(64))
@@ -68,7 +68,7 @@ async def test_bits_are_flipped_and_pieces_vanish_as_often_as_is_said(line: Line
     assert (figures["down"].flipped, bytes(line.up)) == (64, b"")
 
 
-async def test_a_port_that_is_unplugged_and_plugged_in_is_found_again(line: Line) -> None:
+async def test_a_replugged_port_is_found_again(line: Line) -> None:
     await line.proxy.unplug()
     await until(lambda: not line.host.connected, "the loss")
     assert "unplugged" in line.host.problem or line.host.problem
@@ -79,7 +79,7 @@ async def test_a_port_that_is_unplugged_and_plugged_in_is_found_again(line: Line
     assert line.host.reconnects == 1
 
 
-async def test_every_port_of_an_emulator_has_its_proxy(tmp_path: Path) -> None:
+async def test_every_port_of_an_emulator_gets_a_proxy(tmp_path: Path) -> None:
     before = len(os.listdir("/dev/fd"))
     serial, tcp = Pty(tmp_path / "ports" / "scan"), TcpPort(tmp_path / "ports" / "base", 0)
     (tmp_path / "ports").mkdir()

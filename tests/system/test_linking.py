@@ -84,7 +84,7 @@ except ValueError as error:
 
 @pytest.fixture(scope="module")
 def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with a module of kernels, and a cache folder in which they are linked."""
+    """Return a folder with a module of kernels, and a cache folder with their library."""
     if not precompile.can_link():
         pytest.skip("there is no C++ compiler here, no Python.h, or no setuptools")
     place = tmp_path_factory.mktemp("linking")
@@ -97,7 +97,7 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def run(place: Path, program: str) -> str:
-    """Run a program that uses the kernels; return what it prints."""
+    """Run a program that uses the kernels; return its output."""
     paths = os.pathsep.join((str(place), *filter(None, sys.path)))
     environment = os.environ | {cache.FOLDER: str(place / "kept"), "PYTHONPATH": paths}
     done = subprocess.run(
@@ -115,21 +115,21 @@ def test_a_linked_kernel_runs_without_numba(place: Path) -> None:
     "points",
     ["np.arange(3.0, dtype=np.float32)", "np.arange(0.0, 3.0, 0.5)[::2]", "np.arange(3)"],
 )
-def test_for_values_of_other_types_numba_compiles_it(place: Path, points: str) -> None:
+def test_numba_compiles_a_kernel_for_other_argument_types(place: Path, points: str) -> None:
     assert run(place, ALONG.format(points)) == "0.5 2.5 4.5 3 True"
 
 
-def test_other_threads_run_beside_a_linked_kernel(place: Path) -> None:
+def test_a_linked_kernel_releases_the_gil(place: Path) -> None:
     assert run(place, RUNS_BESIDE) == "True False"
 
 
-def test_a_linked_kernel_raises_what_it_would_raise(place: Path) -> None:
+def test_a_linked_kernel_raises_its_exceptions(place: Path) -> None:
     assert run(place, REFUSES) == "too large False"
 
 
 @pytest.fixture
 def load_again() -> Iterator[Callable[[], None]]:
-    """Forget which libraries are loaded, now and after the test."""
+    """Forget the loaded libraries, now and after the test."""
     load_all.cache_clear()
     yield load_all.cache_clear
     load_all.cache_clear()
@@ -146,7 +146,7 @@ def test_after_a_change_of_any_kernel_the_library_is_not_used(
 
 
 @pytest.mark.parametrize("end", [INDEX, LIBRARY])
-def test_a_library_that_is_broken_is_left_to_numba(
+def test_with_a_broken_library_numba_compiles(
     end: str,
     place: Path,
     tmp_path: Path,
@@ -205,10 +205,10 @@ print(len(compared))
 """
 
 
-def test_linked_kernels_give_what_numba_gives_to_the_last_bit() -> None:
+def test_linked_kernels_equal_numba_to_the_last_bit() -> None:
     if not load_all():
         pytest.skip("the kernels are not linked here")
-    environment = os.environ | {"MALLOC_PERTURB_": "1"}  # equal bytes in what is left empty
+    environment = os.environ | {"MALLOC_PERTURB_": "1"}  # equal bytes in uninitialised memory
     done = subprocess.run(
         (sys.executable, "-c", SAME), capture_output=True, text=True, env=environment
     )

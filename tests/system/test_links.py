@@ -1,4 +1,4 @@
-"""Links: they keep themselves open, never block or raise, and send nothing late."""
+"""Links: they reconnect by themselves, never block or raise, and send nothing late."""
 
 import asyncio
 from collections.abc import AsyncIterator
@@ -12,7 +12,7 @@ from gigabrain_drivers.links import serial_link
 from gigabrain_drivers.links.serial_link import SerialLink, open_port
 from gigabrain_zenoh.clock import Clock
 from gigabrain_zenoh.testing.waiting import until
-from tests.system.links import Heard
+from tests.system.links import LinkRecorder
 
 
 @pytest.fixture
@@ -31,18 +31,18 @@ async def link(pty: Pty) -> AsyncIterator[SerialLink]:
 
 
 async def test_bytes_go_both_ways(pty: Pty, link: SerialLink) -> None:
-    received, back = Heard(link), list[bytes]()
+    received, back = LinkRecorder(link), list[bytes]()
     pty.on_bytes = back.append
     link.open()
     await until(lambda: link.connected)
     assert link.write(b"V,0.100,0.500\n")
-    pty.write(b"\x00\n\r\xff")  # a raw line changes nothing
+    pty.write(b"\x00\n\r\xff")  # a raw line changes no byte
     await until(lambda: back and received.data)
     assert (b"".join(back), received.data) == (b"V,0.100,0.500\n", b"\x00\n\r\xff")
     assert (received.opened, received.lost, link.problem) == (1, [], "")
 
 
-async def test_a_port_that_is_not_there_yet_is_waited_for(tmp_path: Path) -> None:
+async def test_a_link_waits_for_a_missing_port(tmp_path: Path) -> None:
     pty, link = Pty(tmp_path / "base"), SerialLink(str(tmp_path / "base"), 115200, Clock())
     link.open()
     assert not link.write(b"too early")
@@ -55,7 +55,7 @@ async def test_a_port_that_is_not_there_yet_is_waited_for(tmp_path: Path) -> Non
 
 
 async def test_an_unplugged_port_is_noticed_and_reopened(pty: Pty, link: SerialLink) -> None:
-    received, back = Heard(link), list[bytes]()
+    received, back = LinkRecorder(link), list[bytes]()
     pty.on_bytes = back.append
     link.open()
     await until(lambda: link.connected)
@@ -68,10 +68,10 @@ async def test_an_unplugged_port_is_noticed_and_reopened(pty: Pty, link: SerialL
     assert (received.opened, link.reconnects, link.health.reconnects) == (2, 1, 1)
     assert link.write(b"new")
     await until(lambda: back)
-    assert back == [b"new"]  # and nothing from before
+    assert back == [b"new"]  # no old bytes
 
 
-async def test_a_port_that_was_unplugged_does_not_spin(
+async def test_an_unplugged_port_does_not_busy_loop(
     pty: Pty, link: SerialLink, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     link.open()
@@ -82,15 +82,15 @@ async def test_a_port_that_was_unplugged_does_not_spin(
     select = selector.select
     monkeypatch.setattr(selector, "select", lambda wait=None: turns.append(wait) or select(wait))
     await asyncio.sleep(0.3)
-    assert 0 < len(turns) < 30  # it would have been thousands
+    assert 0 < len(turns) < 30  # a busy loop would make thousands
 
 
-async def test_a_host_that_reads_nothing_gets_nothing_old(pty: Pty, link: SerialLink) -> None:
+async def test_a_device_that_read_nothing_gets_no_old_bytes(pty: Pty, link: SerialLink) -> None:
     link.open()
     await until(lambda: link.connected)
     loop = asyncio.get_running_loop()
     assert pty._master is not None
-    loop.remove_reader(pty._master)  # the device stands still
+    loop.remove_reader(pty._master)  # the device stops reading
     sent = 0
     while link.write(b"x" * 64):
         sent += 1
@@ -102,10 +102,10 @@ async def test_a_host_that_reads_nothing_gets_nothing_old(pty: Pty, link: Serial
     await until(lambda: b"".join(back).endswith(b"new"))
     taken = b"".join(back)[:-3]
     assert set(taken) <= {ord("x")}
-    assert len(taken) <= 4096 < 64 * sent  # the rest was thrown away, not sent late
+    assert len(taken) <= 4096 < 64 * sent  # the rest is dropped, not sent late
 
 
-async def test_two_cannot_have_one_port(pty: Pty, link: SerialLink) -> None:
+async def test_a_port_can_be_opened_only_once(pty: Pty, link: SerialLink) -> None:
     link.open()
     await until(lambda: link.connected)
     other = SerialLink(str(pty.path), 115200, Clock())
@@ -115,7 +115,7 @@ async def test_two_cannot_have_one_port(pty: Pty, link: SerialLink) -> None:
     assert link.connected
 
 
-async def test_modem_lines_that_are_not_there_are_no_fault(pty: Pty, link: SerialLink) -> None:
+async def test_missing_modem_lines_are_no_fault(pty: Pty, link: SerialLink) -> None:
     link.set_dtr(False)
     link.open()
     await until(lambda: link.connected)
@@ -127,17 +127,17 @@ async def test_close_works_in_any_state_any_number_of_times(pty: Pty) -> None:
     link = SerialLink(str(pty.path), 115200, Clock())
     await link.close()
     link.open()
-    await link.close()  # while it is opening
+    await link.close()  # while opening
     await link.close()
     link.open()
     await until(lambda: link.connected)
     await link.close()
     assert (link.connected, link.problem) == (False, "closed")
-    again = open_port(str(pty.path), 115200)  # nothing holds it any more
+    again = open_port(str(pty.path), 115200)  # the port is free
     again.close()
 
 
-async def test_a_trace_shows_both_ways(pty: Pty, link: SerialLink) -> None:
+async def test_a_trace_shows_both_directions(pty: Pty, link: SerialLink) -> None:
     seen: list[tuple[str, bytes]] = []
     link.trace = lambda way, data: seen.append((way, data))
     link.open()
@@ -148,12 +148,12 @@ async def test_a_trace_shows_both_ways(pty: Pty, link: SerialLink) -> None:
     assert seen == [("tx", b"out"), ("rx", b"in")]
 
 
-async def test_the_age_is_that_of_the_newest_bytes(pty: Pty, link: SerialLink) -> None:
+async def test_the_age_of_a_link_is_that_of_its_newest_bytes(pty: Pty, link: SerialLink) -> None:
     link.open()
     await until(lambda: link.connected)
     await asyncio.sleep(0.05)
     assert link.health.age_ms >= 45
-    received, loop = Heard(link), asyncio.get_running_loop()
+    received, loop = LinkRecorder(link), asyncio.get_running_loop()
     wrote_s = loop.time()
     pty.write(b"x")
     await until(lambda: received.data)
@@ -193,7 +193,7 @@ def test_a_usb_port_is_named_by_its_numbers() -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "said"),
+    ("name", "expected"),
     [
         ("usb:12345:0043", "up to four hexadecimal digits"),
         ("usb:2341:-43", "up to four hexadecimal digits"),
@@ -203,17 +203,17 @@ def test_a_usb_port_is_named_by_its_numbers() -> None:
         ("tcp://1.2.3.4:5", "expected a path"),
     ],
 )
-def test_what_can_be_no_serial_port_is_refused_with_its_field(name: str, said: str) -> None:
-    with pytest.raises(ValueError, match=f"^port: .*{said}"):
+def test_invalid_port_names_are_refused_with_their_field(name: str, expected: str) -> None:
+    with pytest.raises(ValueError, match=f"^port: .*{expected}"):
         serial_link.check_port(name)
 
 
 @pytest.mark.parametrize("name", ["auto", "usb:2341:0043", "usb:2341:43:A-1", "/dev/ttyUSB0"])
-def test_what_may_be_a_serial_port_is_taken(name: str) -> None:
+def test_valid_port_names_are_accepted(name: str) -> None:
     serial_link.check_port(name)
 
 
-def test_what_is_wrong_with_a_port_says_what_to_do() -> None:
+def test_port_problems_have_a_remedy() -> None:
     assert (
         serial_link.describe_missing("usb:0483:5740")
         == "no USB device usb:0483:5740: is it plugged in?"
@@ -224,7 +224,7 @@ def test_what_is_wrong_with_a_port_says_what_to_do() -> None:
 
 
 @pytest.mark.parametrize("path", ["/dev/null", "/tmp"])
-async def test_what_is_no_serial_port_is_called_so(path: str) -> None:
+async def test_a_path_that_is_no_serial_port_is_reported_as_such(path: str) -> None:
     link = SerialLink(path, 115200, Clock())
     link.open()
     await until(lambda: link.problem == f"{path} is not a serial port")

@@ -16,11 +16,11 @@ from rich.cells import cell_len
 from gigabrain_zenoh.testing.processes import AVOID, GIGABRAIN, Home
 from gigabrain_zenoh.testing.waiting import until
 
-# becomes the leader of the terminal's session, as a shell would, and then the command
+# make this process the leader of the terminal's session, as a shell does, then run the command
 AT_TERMINAL = "import os, sys; os.login_tty(0); os.execv(sys.argv[1], sys.argv[1:])"
 COLUMNS, ROWS = 80, 24
 HOME = "\x1b[H"
-TOLD = [
+EXPECTED_LINES = [
     r"\d\.\d\d m in \d+ of 600 s",
     r"\d+ %  1\d\.\d V",
     *(
@@ -59,21 +59,21 @@ class Terminal:
                 self.shown += data.decode()
         except BlockingIOError:
             pass
-        except OSError:  # how Linux tells that nobody holds the terminal any more
+        except OSError:  # Linux's error when no process has the terminal open
             return False
         return self._process.poll() is None
 
     def shows(self, text: str) -> bool:
-        """True while the command runs and its newest page contains `text`."""
+        """Return whether the command runs and its newest page contains `text`."""
         return self.running and any(text in line for line in self.page())
 
     def page(self) -> list[str]:
-        """The lines of the newest whole page."""
+        """Return the lines of the newest complete page."""
         pages = self.shown.split(HOME)
         return CONTROL.sub("", pages[-2] if len(pages) > 2 else "").splitlines()
 
     def text(self) -> str:
-        """The newest whole page."""
+        """Return the newest complete page."""
         return "\n".join(self.page())
 
     def type(self, keys: str) -> None:
@@ -81,12 +81,12 @@ class Terminal:
         os.write(self._screen, keys.encode())
 
     async def ended(self) -> int:
-        """Wait for the command's end; its exit code."""
+        """Wait for the command's end; return its exit code."""
         await until(lambda: not self.running, "the end of the command")
         return self._process.wait(5.0)
 
     def close(self) -> None:
-        """End it."""
+        """Kill the command and close the terminal."""
         self._process.kill()
         self._process.wait(5.0)
         os.close(self._screen)
@@ -104,8 +104,11 @@ async def test_the_page_shows_the_whole_robot_and_ctrl_c_ends_it(
     home: Home, terminal: Terminal
 ) -> None:
     await until(lambda: terminal.shows("enabled") and terminal.shows(" ms (p99 "), "driving")
-    for told in TOLD:  # who has begun last is heard of last
-        await until(lambda told=told: terminal.running and re.search(told, terminal.text()), told)
+    for pattern in EXPECTED_LINES:  # processes appear as they start
+        await until(
+            lambda pattern=pattern: terminal.running and re.search(pattern, terminal.text()),
+            pattern,
+        )
     page = terminal.page()
     assert len(page) <= ROWS
     assert {cell_len(line) for line in page if line.strip()} == {COLUMNS}

@@ -47,7 +47,7 @@ def test_it_weighs_twelve_kilograms_and_stands_level(simulation: Simulation) -> 
     assert height == pytest.approx(0.08, abs=0.001)
 
 
-def test_its_outline_is_that_of_its_file(simulation: Simulation) -> None:
+def test_its_outline_is_the_footprint_of_its_file(simulation: Simulation) -> None:
     corners = catalog.load_robot("mycustombot").footprint
     outline = simulation.truth.footprint
     assert max(x for x, _ in corners) >= outline.front >= 0.19
@@ -93,10 +93,10 @@ def test_a_square_closes_within_a_centimetre_by_odometry(simulation: Simulation)
 def test_its_lidar_looks_between_the_decks_all_round(simulation: Simulation) -> None:
     seen = simulation.scan()
     assert seen.shape == (360,)
-    assert np.all(seen > 0.5)  # nothing of itself
+    assert np.all(seen > 0.5)  # nothing of the robot itself
 
 
-async def test_without_its_emulator_the_robot_is_not_there_yet(tmp_path: Path) -> None:
+async def test_without_its_emulator_the_robot_is_not_connected(tmp_path: Path) -> None:
     run = Run(folder=Path(), link="emulated", emulator=str(tmp_path))
     _, driver = catalog.make_driver("mycustombot", run)
     async with driver:
@@ -135,7 +135,7 @@ async def connected(pair: Pair, wanted: bool = True) -> None:
 
 
 async def drive(pair: Pair, so: Callable[[], object] | None = None, ticks: int = 10) -> None:
-    """Ask for 0.2 m/s in each tick, for so many, or until something is so."""
+    """Command 0.2 m/s in each tick, for `ticks` ticks or until `so` holds."""
     async with asyncio.timeout(60):
         for tick in itertools.count():
             if so() if so else tick >= ticks:
@@ -144,11 +144,11 @@ async def drive(pair: Pair, so: Callable[[], object] | None = None, ticks: int =
             await asyncio.sleep(0.02)
 
 
-async def test_it_drives_in_mujoco_by_bytes_alone(pair: Pair) -> None:
+async def test_its_driver_drives_the_simulated_body_by_bytes_alone(pair: Pair) -> None:
     await connected(pair)
     true = pair.emulator.body
     await drive(pair, lambda: true.snapshot.odometry.x > 0.15 and abs(pair.speed() - 0.2) < 0.02)
-    async with asyncio.timeout(60):  # what it reports is a moment older
+    async with asyncio.timeout(60):  # its report is slightly older
         while True:
             await drive(pair, ticks=1)
             state = await pair.driver.read_state()
@@ -162,7 +162,7 @@ async def test_it_drives_in_mujoco_by_bytes_alone(pair: Pair) -> None:
     assert pair.scans[-1].ranges_m.shape == (360,)
 
 
-async def test_the_scan_and_the_base_fail_apart(pair: Pair) -> None:
+async def test_scan_and_base_fail_independently(pair: Pair) -> None:
     await connected(pair)
     await until(lambda: pair.scans)
     pair.emulator.set({"scan": Faults(unplugged=True)})
@@ -175,16 +175,14 @@ async def test_the_scan_and_the_base_fail_apart(pair: Pair) -> None:
 
 
 @pytest.mark.parametrize("fault", [Faults(unplugged=True), Faults(deaf=True)])
-async def test_a_body_that_hears_nothing_any_more_stops_by_itself(
-    pair: Pair, fault: Faults
-) -> None:
+async def test_a_body_without_commands_stops_by_itself(pair: Pair, fault: Faults) -> None:
     await connected(pair)
     await drive(pair, lambda: pair.speed() > 0.1)
     pair.emulator.set({"base": fault})
     await drive(pair, lambda: abs(pair.speed()) < 0.001)
 
 
-async def test_no_old_bytes_are_obeyed_after_a_freeze(pair: Pair) -> None:
+async def test_old_bytes_are_not_obeyed_after_a_freeze(pair: Pair) -> None:
     await connected(pair)
     device = pair.emulator.stations["base"].device
     assert isinstance(device, LineBase)
@@ -198,7 +196,7 @@ async def test_no_old_bytes_are_obeyed_after_a_freeze(pair: Pair) -> None:
     assert device.executed[0].linear_x == 0.0
 
 
-async def test_a_broken_body_does_not_do_what_it_is_told(pair: Pair) -> None:
+async def test_a_broken_motor_or_wheel_changes_the_motion(pair: Pair) -> None:
     await connected(pair)
     body = pair.emulator.body
     pair.emulator.set({"base": Faults(runaway=0.1)})
@@ -217,7 +215,7 @@ async def test_a_broken_body_does_not_do_what_it_is_told(pair: Pair) -> None:
     assert body.snapshot is frozen
 
 
-def test_faults_are_words(tmp_path: Path) -> None:
+def test_faults_are_set_by_typed_commands(tmp_path: Path) -> None:
     emulator = Emulator("mycustombot", Run(folder=Path(), link="emulated", emulator=str(tmp_path)))
     both = emulator.parse_faults("silence bit_errors=0.01")
     assert both == dict.fromkeys(("base", "scan"), Faults(silence=True, bit_errors=0.01))
@@ -228,13 +226,13 @@ def test_faults_are_words(tmp_path: Path) -> None:
     assert emulator.parse_faults("off") == {"base": NO_FAULTS, "scan": NO_FAULTS}
     with pytest.raises(ConfigError, match="no fault 'silense'; did you mean 'silence'"):
         emulator.parse_faults("silense")
-    for words, said in (
+    for words, expected in (
         ("bit_errors=2", "bit_errors needs a number from 0 to 1, such as bit_errors=0.001"),
         ("garbage", "garbage needs a number from 0 to 1, such as garbage=0.1"),
         ("brown_out=x", "brown_out needs a number of volts from 0, such as brown_out=6"),
         ("silence=3", "silence takes no number: write silence, and off to end it"),
     ):
-        with pytest.raises(ConfigError, match=f"^{said}$"):
+        with pytest.raises(ConfigError, match=f"^{expected}$"):
             emulator.parse_faults(words)
 
 

@@ -1,4 +1,4 @@
-"""The robot on one host, its brain on another, a real network between them, and its faults."""
+"""The robot on one host, its brain on another, and faults of the real network between them."""
 
 import asyncio
 import json
@@ -29,12 +29,12 @@ from tests.places import ROOT
 from tests.system.netns import Network, network
 
 STOP_TICKS = 6  # 120 ms
-REST_TICKS = 40  # by then the ramp has ended
+REST_TICKS = 40  # the ramp ends within this
 RETURN_TICKS = 150  # 3 s
 
 
 class Site:
-    """A robot and its brain on hosts of their own."""
+    """A robot and its brain on separate hosts."""
 
     def __init__(self, stack: ExitStack, net: Network, folder: Path, resume: str) -> None:
         self.net, self._resume = net, resume
@@ -44,7 +44,7 @@ class Site:
         self.endpoint = Endpoint(connect=(f"tcp/{net.address['robot']}:7447",))
 
     def up(self, host: str, router: str = "") -> None:
-        """Start a host's part of the three hosts' deployment."""
+        """Start the part of the three-host deployment that belongs to a host."""
         text = (ROOT / "deploy" / "three_hosts.yaml").read_text()
         values = {"router": router or self.endpoint.connect[0], "resume": self._resume}
         for key, value in values.items():
@@ -61,12 +61,12 @@ class Site:
         return [record for record in records if record["event"] == event]
 
 
-class Ears:
-    """Hears what a probe receives in its order, also while the test's loop stalls."""
+class BusRecorder:
+    """Records commands and ticks of intents in their order, also while the test's loop stalls."""
 
     def __init__(self, robot: Probe) -> None:
         self.commands = deque[CmdVel](maxlen=10_000)
-        self._intents = deque[int](maxlen=10_000)  # the robot's tick when each one arrived
+        self._intents = deque[int](maxlen=10_000)  # the robot's tick at each arrival
         self._tick = 0
         command, state = Codec(CmdVel, CMD_VEL.max_bytes), Codec(RobotState, STATE.max_bytes)
 
@@ -74,11 +74,13 @@ class Ears:
             self._tick = state.decode(payload).tick
 
         robot.bus.tap(STATE.key, on_state)
-        robot.bus.tap(CMD_VEL.key, lambda *said: self.commands.append(command.decode(said[2])))
+        robot.bus.tap(
+            CMD_VEL.key, lambda *message: self.commands.append(command.decode(message[2]))
+        )
         robot.bus.tap(INTENT.key, lambda *_: self._intents.append(self._tick))
 
     def silence(self, after: int) -> tuple[int, int]:
-        """Return the ticks at which the last intent before a silence came, and the first after."""
+        """Return the ticks of the last intent before a silence and of the first one after it."""
         ticks = [after, *(tick for tick in self._intents if tick >= after)]
         gaps = ((a, b) for a, b in pairwise(ticks) if b - a > STOP_TICKS)
         return next(gaps, (ticks[-1], ticks[-1]))
@@ -86,10 +88,10 @@ class Ears:
 
 @pytest.fixture(scope="module")
 def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Site]:
-    """A simulated robot that goes on by itself after a fault."""
+    """A simulated robot that resumes by itself after a fault."""
     with network("robot", "brain") as net, ExitStack() as stack:
         made = Site(stack, net, tmp_path_factory.mktemp("auto"), "auto")
-        made.up("brain")  # the order does not matter
+        made.up("brain")  # either order works
         made.up("robot")
         yield made
 
@@ -101,14 +103,14 @@ async def robot(site: Site) -> AsyncIterator[Probe]:
 
 
 async def drives_again(robot: Probe, since: int) -> None:
-    """Soon after the tick `since`, wherever to: it may just have a wall before it."""
+    """Wait until the robot moves in any direction, within RETURN_TICKS after `since`."""
     await until(
         lambda: robot.state.gate.mode == "enabled" and not at_rest(robot.state), "it drives again"
     )
     assert robot.state.tick - since <= RETURN_TICKS
 
 
-async def nothing_stale_or_touched(robot: Probe) -> None:
+async def assert_no_stale_command_or_contact(robot: Probe) -> None:
     truth = await robot.truth()
     assert (truth["stale_commands_executed"], truth["contacts"]) == (0, 0)
 
@@ -117,10 +119,10 @@ async def nothing_stale_or_touched(robot: Probe) -> None:
     "seconds",
     [0.3, 3.0, pytest.param(0.1, marks=pytest.mark.qa), pytest.param(1.0, marks=pytest.mark.qa)],
 )
-async def test_a_brain_that_is_cut_off_stops_the_robot_and_holds_up_nobody_else(
+async def test_a_disconnected_brain_stops_the_robot_and_delays_no_other_client(
     site: Site, robot: Probe, seconds: float
 ) -> None:
-    ears = Ears(robot)
+    recorder = BusRecorder(robot)
     await robot.driving_straight(0.19)
     start = robot.state.tick
     site.net.cut("brain")
@@ -128,21 +130,21 @@ async def test_a_brain_that_is_cut_off_stops_the_robot_and_holds_up_nobody_else(
     site.net.join("brain")
     back = robot.state.tick
     await drives_again(robot, back)
-    last, first = ears.silence(start)
-    slow = last + STOP_TICKS + 1  # one for the news of the tick at which the last one came
-    drove = max(c.linear_x for c in ears.commands if last <= c.tick < slow)
-    late = [c.linear_x for c in ears.commands if slow <= c.tick < min(first, back)]
+    last, first = recorder.silence(start)
+    slow = last + STOP_TICKS + 1  # one tick more: the tick of the last intent is known late
+    drove = max(c.linear_x for c in recorder.commands if last <= c.tick < slow)
+    late = [c.linear_x for c in recorder.commands if slow <= c.tick < min(first, back)]
     assert late or seconds < 0.3
     assert all(speed < drove for speed in late)
     standing = [s for s in robot.states if slow + REST_TICKS <= s.tick <= back]
     assert all(at_rest(state) for state in standing)
     received = [s.tick for s in robot.states if start <= s.tick <= back]
-    assert max(b - a for a, b in pairwise(received)) <= 25  # no other client is delayed
-    await nothing_stale_or_touched(robot)
+    assert max(b - a for a, b in pairwise(received)) <= 25  # other clients are not delayed
+    await assert_no_stale_command_or_contact(robot)
 
 
-async def killed_router(site: Site, robot: Probe) -> int:
-    """Kill it while the robot drives; the tick at which the robot is heard through it again."""
+async def kill_router(site: Site, robot: Probe) -> int:
+    """Kill the router during a drive; return the tick of the first state after its restart."""
     pid = await robot.pid("router")
     await robot.driving_straight(0.19)
     start = robot.state
@@ -150,20 +152,20 @@ async def killed_router(site: Site, robot: Probe) -> int:
     await until(lambda: len(site.records("router", "ready")) == 2, "the router is back")
     await until(lambda: robot.state.tick > start.tick + 10, "the robot is heard again")
     stopped = [r["tick"] for r in site.records("driver", "gate") if r["mode"] == "stopping"]
-    assert stopped[-1] - start.tick <= STOP_TICKS + 1  # one for the news of the first tick
+    assert stopped[-1] - start.tick <= STOP_TICKS + 1  # one tick more, as above
     assert robot.distance_from(start) <= 0.10
     return next(state.tick for state in robot.states if state.tick > start.tick + 10)
 
 
-async def test_a_killed_router_stops_the_robot_which_drives_again_soon_after_its_return(
+async def test_a_killed_router_stops_the_robot_until_the_router_is_back(
     site: Site, robot: Probe
 ) -> None:
-    await drives_again(robot, await killed_router(site, robot))
-    await nothing_stale_or_touched(robot)
+    await drives_again(robot, await kill_router(site, robot))
+    await assert_no_stale_command_or_contact(robot)
 
 
 @pytest.mark.slow
-async def test_with_manual_resume_no_fault_of_the_network_ends_in_motion(tmp_path: Path) -> None:
+async def test_with_manual_resume_the_robot_stands_after_any_network_fault(tmp_path: Path) -> None:
     with network("robot", "brain", subnet=78) as net, ExitStack() as stack:
         site = Site(stack, net, tmp_path, "manual")
         site.up("robot")
@@ -175,7 +177,7 @@ async def test_with_manual_resume_no_fault_of_the_network_ends_in_motion(tmp_pat
             await person.release()
             await robot.driving_straight(0.15, by_hand=True)
             net.cut("brain")
-            await asyncio.sleep(1.0)  # the router has noticed, and is heard nevertheless
+            await asyncio.sleep(1.0)  # until the router noticed
             assert (await person.estop()).gate.mode == "latched"
             net.join("brain")
             await until(lambda: robot.state.gate.mode == "latched", "everybody knows")
@@ -183,13 +185,13 @@ async def test_with_manual_resume_no_fault_of_the_network_ends_in_motion(tmp_pat
             await person.release()
             await stands_until_enabled(robot)
             await robot.driving_straight(0.15, by_hand=True)
-            await killed_router(site, robot)
+            await kill_router(site, robot)
             await stands_until_enabled(robot)
-            await nothing_stale_or_touched(robot)
+            await assert_no_stale_command_or_contact(robot)
 
 
 async def stands_until_enabled(robot: Probe) -> None:
-    """Nothing speaks against driving any more, and still it does not."""
+    """Assert that the robot still stands when all causes are gone."""
     await until(lambda: robot.state.gate.mode == "idle", "the gate shuts")
     await until(lambda: not robot.state.gate.causes, "all is well again")
     start = robot.state
@@ -198,8 +200,8 @@ async def stands_until_enabled(robot: Probe) -> None:
     assert robot.distance_from(start) <= 0.001
 
 
-# what is wrong with the brain's link, and whether the robot drives nevertheless; None where that
-# depends on how busy this machine is
+# fault of the brain's link, and whether the robot drives with it; None where that depends on the
+# load of this machine
 LINKS = [
     ("20 ms there and back", Chaos(delay_ms=10), True),
     ("50 ms there and back", Chaos(delay_ms=25), None),
@@ -220,7 +222,7 @@ LOOK_TICKS, LOOKS = 100, 10
         pytest.param(LINKS, id="all", marks=pytest.mark.qa),
     ],
 )
-async def test_over_a_bad_link_the_robot_drives_or_stands_and_does_not_stutter(
+async def test_over_a_bad_link_the_robot_drives_or_stands_without_stuttering(
     links: list[tuple[str, Chaos, bool | None]], tmp_path: Path
 ) -> None:
     with network("robot", "brain", subnet=79) as net, ExitStack() as stack:
@@ -233,18 +235,18 @@ async def test_over_a_bad_link_the_robot_drives_or_stands_and_does_not_stutter(
                 for name, link, drives in links:
                     proxy.set(link)
                     await robot.ticks(REST_TICKS)
-                    await judge(robot, name, drives)
+                    await assert_steady(robot, name, drives)
                 proxy.set(CALM)
                 await drives_again(robot, robot.state.tick)
-                proxy.set(Chaos(corrupt=1e-3))  # without TLS some of it passes for messages
-                await judge(robot, "a bit flipped in one byte of a thousand", None)
-                await nothing_stale_or_touched(robot)
+                proxy.set(Chaos(corrupt=1e-3))  # without TLS some corrupt bytes are valid messages
+                await assert_steady(robot, "a bit flipped in one byte of a thousand", None)
+                await assert_no_stale_command_or_contact(robot)
 
 
-async def judge(robot: Probe, name: str, drives: bool | None) -> None:
-    """It starts at most once a second, and mostly drives or always stands where that is known.
+async def assert_steady(robot: Probe, name: str, drives: bool | None) -> None:
+    """Assert that it starts at most once a second, and mostly drives or always stands, if known.
 
-    Where it drives, this machine may hold up for a while what the link does not.
+    If it should drive, look several times, because this machine may be busy for a while.
     """
     for _ in range(LOOKS):
         start = robot.state.tick

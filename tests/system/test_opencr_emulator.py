@@ -1,4 +1,4 @@
-"""The emulated OpenCR: the vendor's firmware, as the vendor's own SDK and the facts see it."""
+"""The emulated OpenCR behaves like the vendor's firmware, also with the vendor's SDK."""
 
 import asyncio
 import itertools
@@ -26,7 +26,7 @@ MS = 1_000_000
 
 
 class Wire:
-    """A wire that keeps the answers of the board."""
+    """A wire that records the replies of the board."""
 
     def __init__(self) -> None:
         self._decoder = DynamixelDecoder()
@@ -38,7 +38,7 @@ class Wire:
 
 
 class Bench:
-    """A board in the hand: time passes when the test says so."""
+    """A board in fake time."""
 
     def __init__(self, robot: str) -> None:
         assert load_robot(robot)
@@ -75,7 +75,7 @@ def make_bench() -> Bench:
     return Bench("turtlebot3_waffle")
 
 
-def test_it_says_who_it_is(bench: Bench) -> None:
+def test_it_reports_its_model_and_firmware(bench: Bench) -> None:
     answer = bench.ask(opencr.ping(200))
     assert answer == DynamixelPacket(200, opencr.STATUS, bytes([0, 0x00, 0x50, 5]))
     assert bench.read(0, 10).hex(" ") == "00 50 02 00 00 00 05 c8 03 02"
@@ -94,18 +94,18 @@ def test_it_says_who_it_is(bench: Bench) -> None:
     ],
     ids=["other id", "broadcast", "sync read", "too long", "short read", "empty write", "status"],
 )
-def test_other_things_are_ignored_in_silence(bench: Bench, frame: bytes) -> None:
+def test_frames_for_other_devices_are_ignored(bench: Bench, frame: bytes) -> None:
     assert bench.ask(frame) is None
 
 
-def test_only_whole_items_are_read_and_gaps_are_zero(bench: Bench) -> None:
+def test_only_whole_items_can_be_read_and_gaps_are_zero(bench: Bench) -> None:
     assert bench.read(1, 1) == b"\0"
     assert bench.read(0, 2) == b"\x00\x50"
     assert bench.read(51, 8) == bytes(8)
     assert len(bench.read(10, 172)) == 172
 
 
-def test_only_whole_items_are_written(bench: Bench) -> None:
+def test_only_whole_items_can_be_written(bench: Bench) -> None:
     bench.ask(opencr.write(200, 150, b"\x01\x02\x03"))
     assert bench.read(150, 4) == bytes(4)
     bench.ask(opencr.write(200, 149, b"\x00" + struct.pack("<i", 7) + b"\xff"))
@@ -119,14 +119,14 @@ def test_without_a_heartbeat_nothing_moves(bench: Bench) -> None:
     assert bench.read(15, 1) == b"\0"
 
 
-def test_a_velocity_is_obeyed_in_the_motors_own_units(bench: Bench) -> None:
+def test_a_velocity_is_rounded_to_the_units_of_the_motors(bench: Bench) -> None:
     bench.drive(0.15, 0.3, beat=1)
     forward, _, turn = bench.body.commanded
     assert forward == pytest.approx((135 + 243) / 2 / 1263.632956882)
     assert turn == pytest.approx((243 - 135) / 1263.632956882 / 0.287)
 
 
-def test_a_wheel_that_would_be_too_fast_is_slowed_down_by_itself(bench: Bench) -> None:
+def test_each_wheel_is_limited_separately(bench: Bench) -> None:
     bench.drive(0.26, 1.0, beat=1)
     forward, _, turn = bench.body.commanded
     assert forward == pytest.approx((147 + 337) / 2 / 1263.632956882)
@@ -137,7 +137,7 @@ def test_a_wheel_that_would_be_too_fast_is_slowed_down_by_itself(bench: Bench) -
     ("robot", "forward", "turn"),
     [("turtlebot3_burger", 0.2108, 2.635), ("turtlebot3_waffle", 0.2661, 1.854)],
 )
-def test_speeds_are_cut_off_as_the_firmware_does(robot: str, forward: float, turn: float) -> None:
+def test_speeds_are_limited_as_in_the_firmware(robot: str, forward: float, turn: float) -> None:
     bench = Bench(robot)
     bench.drive(1.0, 0.0, beat=1)
     assert bench.body.commanded[0] == pytest.approx(forward, abs=1e-3)
@@ -156,7 +156,7 @@ def test_the_wheels_stop_half_a_second_after_the_heartbeat_last_changed(bench: B
     assert bench.read(15, 1) == b"\0"
 
 
-def test_a_heartbeat_alone_does_not_bring_the_old_speed_back(bench: Bench) -> None:
+def test_a_heartbeat_alone_does_not_restore_the_old_speed(bench: Bench) -> None:
     bench.drive(0.2, 0.0, beat=1)
     bench.wait(600)
     bench.ask(opencr.heartbeat(2))
@@ -164,7 +164,7 @@ def test_a_heartbeat_alone_does_not_bring_the_old_speed_back(bench: Bench) -> No
     assert bench.body.commanded == (0.0, 0.0, 0.0)
 
 
-def test_in_debug_mode_it_would_drive_on(bench: Bench) -> None:
+def test_in_debug_mode_it_drives_on_without_a_heartbeat(bench: Bench) -> None:
     bench.ask(opencr.write(200, 14, b"\x01"))
     bench.drive(0.2, 0.0, beat=1)
     bench.wait(2000)
@@ -177,7 +177,7 @@ def test_without_torque_it_stands(bench: Bench) -> None:
     assert bench.body.commanded == (0.0, 0.0, 0.0)
 
 
-def test_calibration_makes_it_deaf_for_five_seconds(bench: Bench) -> None:
+def test_it_ignores_everything_for_five_seconds_of_calibration(bench: Bench) -> None:
     assert bench.ask(opencr.write(200, 59, b"\x01")) is None
     assert bench.ask(opencr.ping(200)) is None
     bench.wait(4980)
@@ -200,7 +200,7 @@ def test_the_charge_stands_still_below_ten_and_a_half_volts(bench: Bench) -> Non
     assert charge()[1] == percentage
 
 
-def test_with_too_little_voltage_it_is_off_and_starts_anew_with_enough(bench: Bench) -> None:
+def test_it_is_off_at_low_voltage_and_restarts_afterwards(bench: Bench) -> None:
     bench.drive(0.2, 0.0, beat=1)
     bench.board.sag_volts = 9.0
     bench.wait(20)
@@ -212,10 +212,10 @@ def test_with_too_little_voltage_it_is_off_and_starts_anew_with_enough(bench: Be
     assert bench.read(150, 4) == bytes(4)
 
 
-async def test_the_vendors_sdk_reads_and_drives_it(
+async def test_the_vendors_sdk_reads_and_drives_the_board(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    # it waits this long twice [ms]; its 16 are less than a busy machine may take
+    # [ms], timeout of the SDK; its default of 16 is too short for a busy machine
     monkeypatch.setattr(dynamixel_sdk.port_handler, "LATENCY_TIMER", 1000)
     body = emulated_body("turtlebot3_waffle", Run(folder=Path()))
     port = Pty(tmp_path / "base")
@@ -236,12 +236,12 @@ def _by_the_sdk(path: str, body: EmulatedBody) -> None:
     assert line.setBaudRate(1_000_000)
 
     def readings() -> opencr.Readings:
-        (data,) = _told(sdk.readTxRx(line, 200, 10, 172))
+        (data,) = _successful_value(sdk.readTxRx(line, 200, 10, 172))
         return opencr.decode_readings(bytes(data))
 
     try:
-        assert _told(sdk.ping(line, 200)) == [0x5000]
-        assert _told(sdk.read4ByteTxRx(line, 200, 2)) == [2]
+        assert _successful_value(sdk.ping(line, 200)) == [0x5000]
+        assert _successful_value(sdk.read4ByteTxRx(line, 200, 2)) == [2]
         _until(lambda: readings().linear_acceleration[2] == pytest.approx(9.81, abs=0.2))
         found = readings()
         assert 12.3 < found.voltage < 12.7
@@ -250,8 +250,10 @@ def _by_the_sdk(path: str, body: EmulatedBody) -> None:
         beats = itertools.cycle(range(256))
 
         def driven() -> bool:
-            _told(sdk.write1ByteTxRx(line, 200, 19, next(beats)))
-            _told(sdk.writeTxRx(line, 200, 150, 24, struct.pack("<6i", 20, 0, 0, 0, 0, 0)))
+            _successful_value(sdk.write1ByteTxRx(line, 200, 19, next(beats)))
+            _successful_value(
+                sdk.writeTxRx(line, 200, 150, 24, struct.pack("<6i", 20, 0, 0, 0, 0, 0))
+            )
             return readings().ticks[0] > 1234 + 500
 
         _until(driven)
@@ -270,8 +272,8 @@ def _until(true: Callable[[], bool]) -> None:
         time.sleep(0.005)
 
 
-def _told(answer: tuple[Any, ...]) -> list[Any]:
-    """Assert that the SDK reports success. Return the first value that it read, as a list."""
+def _successful_value(answer: tuple[Any, ...]) -> list[Any]:
+    """Assert that the SDK reports success; return the values that it read, as a list."""
     *values, result, error = answer
     assert (result, error) == (dynamixel_sdk.COMM_SUCCESS, 0)
     return values[:1]

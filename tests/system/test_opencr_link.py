@@ -20,7 +20,7 @@ from gigabrain_zenoh.clock import Clock
 from tests.unit.drivers.opencr import Rig, make_rig  # noqa: F401
 
 
-async def test_a_failed_read_is_never_taken_for_a_fresh_one(rig: Rig) -> None:
+async def test_a_failed_read_does_not_count_as_a_fresh_one(rig: Rig) -> None:
     await rig.drive(0.0, 0.0, 40)
     before = len(rig.published)
     rig.cable.held = []
@@ -34,7 +34,7 @@ async def test_a_failed_read_is_never_taken_for_a_fresh_one(rig: Rig) -> None:
     assert len(rig.published) == before
 
 
-async def test_an_answer_that_comes_late_is_thrown_away(rig: Rig) -> None:
+async def test_a_late_reply_is_dropped(rig: Rig) -> None:
     await rig.drive(0.0, 0.0, 40)
     before = len(rig.published)
     rig.cable.held = []
@@ -51,7 +51,7 @@ async def test_an_answer_that_comes_late_is_thrown_away(rig: Rig) -> None:
     assert len(rig.published) == before + 1
 
 
-async def test_what_is_left_from_before_a_reconnection_is_not_looked_at(rig: Rig) -> None:
+async def test_bytes_from_before_a_reconnection_are_dropped(rig: Rig) -> None:
     rig.cable.held = []
     await rig.driver.read_state()
     answer = b"".join(rig.cable.held)
@@ -63,7 +63,7 @@ async def test_what_is_left_from_before_a_reconnection_is_not_looked_at(rig: Rig
     assert not (await rig.driver.read_state()).link.connected
 
 
-async def test_a_board_that_has_stopped_answering_gets_its_line_closed(rig: Rig) -> None:
+async def test_the_line_to_a_silent_board_is_closed(rig: Rig) -> None:
     await rig.drive(0.2, 0.0, 200)
     rig.cable.held = []
     await rig.drive(0.2, 0.0, 240)
@@ -77,7 +77,7 @@ async def test_a_board_that_has_stopped_answering_gets_its_line_closed(rig: Rig)
     assert (await rig.driver.read_state()).link.connected
 
 
-async def test_while_the_link_is_down_nothing_is_kept_for_later(rig: Rig) -> None:
+async def test_commands_during_a_lost_link_are_dropped(rig: Rig) -> None:
     rig.cable.drop("unplugged")
     before = len(rig.cable.sent)
     sent = await rig.driver.set_base_velocity(0.2, 0.0, 0.0)
@@ -87,7 +87,7 @@ async def test_while_the_link_is_down_nothing_is_kept_for_later(rig: Rig) -> Non
     assert set(rig.cable.velocities()[before:]) <= {(0, 0)}
 
 
-async def test_somebody_elses_dynamixel_is_not_driven(rig: Rig) -> None:
+async def test_another_dynamixel_device_is_not_driven(rig: Rig) -> None:
     rig.cable.drop("cut")
     rig.cable.to_board = lambda data: None
     rig.cable.plug()
@@ -96,7 +96,7 @@ async def test_somebody_elses_dynamixel_is_not_driven(rig: Rig) -> None:
     assert not (await rig.driver.set_base_velocity(0.2, 0.0, 0.0)).linear_x
 
 
-async def test_a_port_on_which_nobody_answers_is_knocked_at_and_opened_anew(rig: Rig) -> None:
+async def test_a_port_without_replies_is_probed_and_reopened(rig: Rig) -> None:
     rig.cable.drop("cut")
     rig.cable.to_board = lambda data: None
     rig.cable.plug()
@@ -108,7 +108,7 @@ async def test_a_port_on_which_nobody_answers_is_knocked_at_and_opened_anew(rig:
     assert rig.cable.drops[-1].endswith("is open, but no OpenCR answers: right port, power on?")
 
 
-async def test_silent_motors_and_debug_mode_count_as_a_body_that_does_not_answer(
+async def test_silent_motors_and_debug_mode_count_as_a_lost_body(
     rig: Rig, caplog: pytest.LogCaptureFixture
 ) -> None:
     caplog.set_level("INFO")
@@ -130,7 +130,7 @@ async def test_silent_motors_and_debug_mode_count_as_a_body_that_does_not_answer
     ]
 
 
-async def test_garbage_and_a_board_that_restarts_do_not_move_the_pose(rig: Rig) -> None:
+async def test_garbage_and_a_board_restart_do_not_move_the_pose(rig: Rig) -> None:
     await rig.drive(0.0, 0.0, 100)
     rig.cable.on_bytes(b"OpenCR boot\r\n\xff\xff\xfd\x00" * 20)
     state = await rig.drive(0.0, 0.0, 100)
@@ -152,7 +152,7 @@ async def test_garbage_and_a_board_that_restarts_do_not_move_the_pose(rig: Rig) 
     ],
     ids=["opencr", "a motor", "nobody", "a lidar"],
 )
-def test_a_port_is_known_by_its_answer(answer: bytes, ours: bool) -> None:
+def test_an_opencr_port_is_recognised_by_its_reply(answer: bytes, ours: bool) -> None:
     class Port:
         written = b""
 
@@ -174,7 +174,7 @@ async def until(true: Callable[[], bool]) -> None:
         await asyncio.sleep(0.005)
 
 
-async def test_over_a_real_pty_it_drives_stops_and_survives_what_a_cable_can_do(
+async def test_over_a_real_pty_it_drives_stops_and_survives_cable_faults(
     tmp_path: Path,
 ) -> None:
     body = emulated_body("turtlebot3_waffle", Run(folder=Path()))
@@ -194,7 +194,7 @@ async def test_over_a_real_pty_it_drives_stops_and_survives_what_a_cable_can_do(
                 await driver.set_base_velocity(goal, 0.0, 0.0)
 
     try:
-        async with driver:  # before there is any port
+        async with driver:  # before the port exists
             task = asyncio.create_task(live())
             await asyncio.sleep(0.1)
             station.start()

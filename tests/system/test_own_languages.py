@@ -1,4 +1,4 @@
-"""`examples/own_process`: programs of one's own without this package, in three languages."""
+"""`examples/own_process`: users' programs without this package, in three languages."""
 
 import asyncio
 import os
@@ -19,11 +19,11 @@ from tests.places import ROOT
 
 EXAMPLES = ROOT / "examples/own_process"
 NODE = shutil.which("node")
-PICO = os.environ.get("ZENOH_PICO", "")  # a folder of zenoh-pico with its build; no registry has it
+PICO = os.environ.get("ZENOH_PICO", "")  # folder of a built zenoh-pico, which no registry has
 
 
 class Robot(NamedTuple):
-    """A robot without decision."""
+    """A robot without a decision process."""
 
     router: str
     page: str
@@ -45,32 +45,32 @@ def run(*command: str) -> str:
 
 
 @pytest.mark.slow
-async def test_a_decision_in_plain_python_drives(robot: Robot) -> None:
+async def test_a_decision_process_in_plain_python_drives(robot: Robot) -> None:
     speeds: list[float] = []
     async with connect(Endpoint(connect=(robot.router,)), "test", timeout_s=None) as bus:
         bus.subscribe(STATE, lambda _key, state: speeds.append(state.velocity.linear_x))
         program = str(EXAMPLES / "drive.py")
-        said = await asyncio.to_thread(run, sys.executable, program, robot.router, "8")
-    assert "intents, the last one: " in said
+        output = await asyncio.to_thread(run, sys.executable, program, robot.router, "8")
+    assert "intents, the last one: " in output
     assert max(speeds) == pytest.approx(0.1, abs=0.02)
 
 
 @pytest.mark.skipif(NODE is None, reason="there is no Node here")
 @pytest.mark.slow
-async def test_javascript_sees_the_robot_through_the_page(robot: Robot) -> None:
+async def test_javascript_reads_the_robot_through_the_page(robot: Robot) -> None:
     assert NODE
     flags = () if "function" in run(NODE, "-p", "typeof WebSocket") else WEBSOCKET_FLAG
     program = str(EXAMPLES / "watch_page.mjs")
-    said = await asyncio.to_thread(run, NODE, *flags, program, robot.page)
-    assert "tick " in said
-    assert "beams, the nearest " in said
+    output = await asyncio.to_thread(run, NODE, *flags, program, robot.page)
+    assert "tick " in output
+    assert "beams, the nearest " in output
 
 
 WEBSOCKET_FLAG = ("--experimental-websocket",)  # Node 20
 
 
 @pytest.mark.skipif(not PICO, reason="zenoh-pico is not here: set ZENOH_PICO to its folder")
-async def test_c_sees_the_robot_and_presses_the_e_stop(robot: Robot, tmp_path: Path) -> None:
+async def test_c_reads_the_robot_and_presses_the_e_stop(robot: Robot, tmp_path: Path) -> None:
     program = tmp_path / "watch"
     pico = Path(PICO)
     includes = [f"-I{pico / 'include'}", f"-I{pico / 'build/include'}"]
@@ -80,6 +80,6 @@ async def test_c_sees_the_robot_and_presses_the_e_stop(robot: Robot, tmp_path: P
     run("cc", *flags, *includes, source, library, "-lpthread", "-lrt", "-o", str(program))
     async with connect(Endpoint(connect=(robot.router,)), "test", timeout_s=None) as bus:
         states = bus.latest(STATE)
-        said = await asyncio.to_thread(run, str(program), robot.router, "estop")
+        output = await asyncio.to_thread(run, str(program), robot.router, "estop")
         await until(lambda: states.newest and states.newest.gate.mode == "latched", "it is latched")
-    assert "e-stop sent" in said
+    assert "e-stop sent" in output

@@ -1,4 +1,4 @@
-"""A process of one's own that raises or hangs costs only itself, and is named everywhere."""
+"""A user's process that raises or hangs affects only itself, and is named everywhere."""
 
 import asyncio
 import os
@@ -87,7 +87,7 @@ bad = bad_company:Behaviour
 
 
 class HomeWithPackage(Home):
-    """A user's folders, where the package is installed."""
+    """A home folder where the package is installed."""
 
     def __init__(self, folder: Path, site: Path) -> None:
         super().__init__(folder)
@@ -95,13 +95,13 @@ class HomeWithPackage(Home):
 
     @property
     def environment(self) -> dict[str, str]:
-        """The environment of its processes."""
+        """Return the environment of its processes."""
         found = super().environment
         return found | {"PYTHONPATH": f"{found['PYTHONPATH']}{os.pathsep}{self._site}"}
 
 
 class Robot:
-    """A running robot, and what was heard of it."""
+    """A running robot, and its messages so far."""
 
     def __init__(self, home: Home, bus: Bus, up: CommandProcess, how: Path) -> None:
         self.home, self.bus, self.up, self.how = home, bus, up, how
@@ -112,25 +112,25 @@ class Robot:
         bus.subscribe(HEALTH, lambda _key, one: self.health.update({one.process: one}))
         bus.subscribe(LOG, lambda _key, one: self.log.append(one))
 
-    async def drives(self) -> None:
-        """Wait until it drives."""
+    async def wait_until_enabled(self) -> None:
+        """Wait until the gate is enabled; forget all earlier states."""
         await until(lambda: self.states and self.states[-1].gate.mode == "enabled", "it drives")
         self.states.clear()
 
     def others(self, name: str) -> set[int]:
-        """The pids of all processes but one."""
+        """Return the pids of all processes but one."""
         return set(self.home.processes()) - set(self.home.processes(name))
 
     @property
-    def stops(self) -> set[str]:
-        """Return the causes of all stops but those of a command that this busy host held up."""
+    def stop_causes(self) -> set[str]:
+        """Return the causes of all stops, without commands that a busy host delayed."""
         assert self.states
         causes = {cause.text for state in self.states for cause in state.gate.causes}
         return causes - {"no valid command for 100 ms"}
 
     @property
     def moves(self) -> bool:
-        """True while the gate is enabled and the robot turns."""
+        """Return whether the gate is enabled and the robot turns."""
         now = self.states[-1]
         return now.gate.mode == "enabled" and now.velocity.angular_z > 0.25
 
@@ -172,7 +172,7 @@ async def start(tmp_path: Path) -> AsyncIterator[object]:
             session = connect(Endpoint(connect=(router,)), "test", timeout_s=None)
             stack.append(session)
             robot = Robot(home, await session.__aenter__(), up, how)
-            await robot.drives()
+            await robot.wait_until_enabled()
             await until(lambda: home.processes(name), "it runs")
             await until(lambda: name in robot.health, "it reports")
             return robot
@@ -186,7 +186,7 @@ async def start(tmp_path: Path) -> AsyncIterator[object]:
 
 
 @pytest.mark.parametrize("name", ["mine", "bad"])
-async def test_one_that_raises_is_named_and_restarted_and_the_robot_drives_on(
+async def test_a_process_that_raises_is_named_and_restarted_while_the_robot_drives(
     name: str, start: object
 ) -> None:
     robot = await start(name)  # type: ignore[operator]
@@ -199,13 +199,13 @@ async def test_one_that_raises_is_named_and_restarted_and_the_robot_drives_on(
     robot.how.unlink()
     await until(lambda: robot.home.processes(name) not in ([], before), "it is restarted")
     assert robot.others(name) == others
-    assert robot.stops == set()
-    await robot.drives()
+    assert robot.stop_causes == set()
+    await robot.wait_until_enabled()
 
 
 @pytest.mark.parametrize("name", ["mine", "bad"])
 @pytest.mark.slow
-async def test_one_that_hangs_is_named_shows_where_and_the_robot_drives_on(
+async def test_a_process_that_hangs_is_killed_with_its_stack_while_the_robot_drives(
     name: str, start: object
 ) -> None:
     robot = await start(name)  # type: ignore[operator]
@@ -218,26 +218,28 @@ async def test_one_that_hangs_is_named_shows_where_and_the_robot_drives_on(
     await until(lambda: robot.home.processes(name) not in ([], before), "it is restarted")
     await until(lambda: not robot.problems, "it is well again")
     assert robot.others(name) == others
-    assert robot.stops == set()
-    await robot.drives()
+    assert robot.stop_causes == set()
+    await robot.wait_until_enabled()
     log = await robot.home.run("log", "--process", name)
     assert f"{name} has made no progress for 5 s" in log.out
 
 
 @pytest.mark.slow
-async def test_one_that_always_raises_is_given_up_and_the_robot_drives_on(start: object) -> None:
+async def test_a_process_that_always_raises_is_given_up_while_the_robot_drives(
+    start: object,
+) -> None:
     robot = await start("mine")  # type: ignore[operator]
     robot.how.write_text("raise")
     await until(lambda: "is given up: 5 deaths" in robot.up.out, "it is given up")
     await until(lambda: "mine died of ValueError: as asked" in robot.problems, "it is named")
-    assert robot.stops == set()
-    await robot.drives()
+    assert robot.stop_causes == set()
+    await robot.wait_until_enabled()
     why = await robot.home.run("why")
     assert "mine died of ValueError: as asked, in bad_company.py:19" in why.out
 
 
 @pytest.mark.parametrize("how", ["raise", "hang"])
-async def test_a_behaviour_that_fails_stops_the_robot_and_nothing_else(
+async def test_a_failing_behaviour_stops_the_robot_but_no_other_process(
     how: str, start: object
 ) -> None:
     robot = await start("decision")  # type: ignore[operator]

@@ -1,4 +1,4 @@
-"""A process of one's own with keys sends what it declares; the rest is refused and noted."""
+"""A user's process with keys may send what it declares; the rest is refused and audited."""
 
 import asyncio
 import os
@@ -30,7 +30,7 @@ async def run(config, bus, ready):
 '''
 
 
-async def test_what_it_does_not_declare_reaches_nobody_and_is_in_the_audit(tmp_path: Path) -> None:
+async def test_undeclared_messages_reach_nobody_and_are_audited(tmp_path: Path) -> None:
     site, fleet = tmp_path / "site", tmp_path / "fleet"
     site.mkdir()
     (site / "greedy.py").write_text(SOURCE)
@@ -40,11 +40,11 @@ async def test_what_it_does_not_declare_reaches_nobody_and_is_in_the_audit(tmp_p
     viewer = str(issue(fleet, "viewer"))
 
     class HomeWithModule(Home):
-        """A user's folders, where the module is installed."""
+        """A home folder where the module is installed."""
 
         @property
         def environment(self) -> dict[str, str]:
-            """The environment of its processes."""
+            """Return the environment of its processes."""
             found = super().environment
             return found | {"PYTHONPATH": f"{found['PYTHONPATH']}{os.pathsep}{site}"}
 
@@ -70,4 +70,4 @@ async def test_what_it_does_not_declare_reaches_nobody_and_is_in_the_audit(tmp_p
         assert "may not put robot/cmd_vel" in audit.out
     finally:
         home.close()
-    assert {one.linear_x for one in driven} == {0.0}  # control's own
+    assert {one.linear_x for one in driven} == {0.0}  # only control's commands arrive

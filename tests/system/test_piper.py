@@ -1,4 +1,4 @@
-"""AgileX Piper: driver and emulator on a CAN bus, with the vendor's SDK as the judge of both."""
+"""AgileX Piper: driver and emulator on a CAN bus, both judged by the vendor's SDK."""
 
 import asyncio
 import contextlib
@@ -73,7 +73,8 @@ async def angles(driver: PiperDriver) -> list[float]:
     return [joint.position for joint in (await driver.read_state()).joints[:6]]
 
 
-async def judge(python: Path, *words: str, address: tuple[str, int] | None = None, given: Any = None
+async def start_judge(
+    python: Path, *words: str, address: tuple[str, int] | None = None, given: Any = None
 ) -> asyncio.subprocess.Process:  # fmt: skip
     config = {"port": address[1], "hop_limit": 0} if address else {}
     return await asyncio.create_subprocess_exec(
@@ -82,7 +83,7 @@ async def judge(python: Path, *words: str, address: tuple[str, int] | None = Non
     )  # fmt: skip
 
 
-async def verdict(process: asyncio.subprocess.Process, given: Any = None) -> Any:
+async def result_of(process: asyncio.subprocess.Process, given: Any = None) -> Any:
     out, _ = await process.communicate(json.dumps(given).encode() if given else b"")
     (line,) = [line for line in out.decode().splitlines() if line.startswith("JSON ")]
     return json.loads(line.removeprefix("JSON "))
@@ -90,14 +91,14 @@ async def verdict(process: asyncio.subprocess.Process, given: Any = None) -> Any
 
 async def test_the_vendors_sdk_drives_the_emulated_arm(python: Path, emulator: Emulator) -> None:
     group, port = read_address(Path(emulator.ports["base"]))
-    told = await verdict(await judge(python, "drive", group, address=(group, port)))
-    assert told.pop("first") == pytest.approx(HOME, abs=0.01)
-    assert told.pop("volts") == pytest.approx(24.0)
-    assert 20 < told.pop("celsius") < 60
-    assert told.pop("status") == [1, 0, 1]
-    assert told.pop("on") == [True] * 6
-    assert told == dict.fromkeys(told, True)
-    assert len(told) == 11
+    results = await result_of(await start_judge(python, "drive", group, address=(group, port)))
+    assert results.pop("first") == pytest.approx(HOME, abs=0.01)
+    assert results.pop("volts") == pytest.approx(24.0)
+    assert 20 < results.pop("celsius") < 60
+    assert results.pop("status") == [1, 0, 1]
+    assert results.pop("on") == [True] * 6
+    assert results == dict.fromkeys(results, True)
+    assert len(results) == 11
 
 
 async def test_the_vendors_sdk_reads_what_the_driver_commands(
@@ -106,27 +107,27 @@ async def test_the_vendors_sdk_reads_what_the_driver_commands(
     address = read_address(Path(emulator.ports["base"]))
     wanted = {"joint1": 0.3, "joint4": -0.2, "joint6": 1.0, "gripper": 0.02}
     async with driver_of(run) as driver:
-        process = await judge(python, "listen", address[0], "4", address=address)
+        process = await start_judge(python, "listen", address[0], "4", address=address)
         assert process.stdout
         while b"listening" not in await process.stdout.readline():
             pass
-        told = asyncio.create_task(verdict(process))
-        while not told.done():
+        results = asyncio.create_task(result_of(process))
+        while not results.done():
             await driver.set_joint_positions(wanted)
             await asyncio.sleep(0.02)
         measured = await angles(driver)
     goal = [0.3, *HOME[1:3], -0.2, HOME[4], 1.0]
-    assert told.result()["joints"] == pytest.approx(goal, abs=0.01)
-    assert told.result()["measured"] == pytest.approx(measured, abs=0.01)
-    assert told.result()["gripper"] == [40_000, 1000, 1]
-    assert told.result()["mode"] == [1, 1, 100, 0]
+    assert results.result()["joints"] == pytest.approx(goal, abs=0.01)
+    assert results.result()["measured"] == pytest.approx(measured, abs=0.01)
+    assert results.result()["gripper"] == [40_000, 1000, 1]
+    assert results.result()["mode"] == [1, 1, 100, 0]
 
 
 async def test_the_model_has_the_kinematics_of_the_vendors_sdk(python: Path) -> None:
     robot, noise = load_robot("piper"), np.random.default_rng(7)
     limits = np.array([(joint.lower, joint.upper) for joint in robot.joints[:6]])
     postures = noise.uniform(*limits.T, (200, 6))
-    poses = await verdict(await judge(python, "kinematics"), postures.tolist())
+    poses = await result_of(await start_judge(python, "kinematics"), postures.tolist())
     model = mujoco.MjModel.from_xml_path(str(robot_path("piper").with_name("model.xml")))
     data, worst_mm, worst_deg = mujoco.MjData(model), 0.0, 0.0
     for posture, pose in zip(postures, poses, strict=True):
@@ -145,7 +146,7 @@ async def test_the_model_has_the_kinematics_of_the_vendors_sdk(python: Path) -> 
     assert worst_deg < 0.01
 
 
-async def test_opening_and_closing_move_the_arm_by_less_than_half_a_degree(
+async def test_opening_and_closing_the_driver_moves_the_arm_by_less_than_half_a_degree(
     emulator: Emulator, run: Run
 ) -> None:
     before = [motor.position for motor in emulator.body.joints[:6]]
@@ -157,7 +158,9 @@ async def test_opening_and_closing_move_the_arm_by_less_than_half_a_degree(
     assert after == pytest.approx(before, abs=math.radians(0.5))
 
 
-async def test_the_arm_is_found_again_and_holds_meanwhile(emulator: Emulator, run: Run) -> None:
+async def test_the_arm_holds_while_unplugged_and_is_found_again(
+    emulator: Emulator, run: Run
+) -> None:
     async with driver_of(run) as driver:
         emulator.set(emulator.parse_faults("base unplugged"))
         await until(lambda: "is the emulator running" in driver.problem)
@@ -168,7 +171,7 @@ async def test_the_arm_is_found_again_and_holds_meanwhile(emulator: Emulator, ru
         assert (await driver.read_state()).link.reconnects == 1
 
 
-async def test_a_driver_that_is_killed_leaves_the_arm_held(emulator: Emulator, run: Run) -> None:
+async def test_a_killed_driver_leaves_the_arm_held(emulator: Emulator, run: Run) -> None:
     child = await asyncio.create_subprocess_exec(
         sys.executable, "-c", DRIVER, run.emulator,
         env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
@@ -183,11 +186,11 @@ async def test_a_driver_that_is_killed_leaves_the_arm_held(emulator: Emulator, r
     for _ in range(20):
         await asyncio.sleep(0.05)
         now = [motor.position for motor in emulator.body.joints]
-        assert now[1:3] == pytest.approx(HOME[1:3], abs=math.radians(2))  # what gravity pulls at
-        assert abs(now[0] - at_kill[0].position) < 0.5 * 0.2  # its last target was near
+        assert now[1:3] == pytest.approx(HOME[1:3], abs=math.radians(2))  # the joints under gravity
+        assert abs(now[0] - at_kill[0].position) < 0.5 * 0.2  # near its last target
 
 
-async def test_a_limp_arm_falls_and_a_frozen_one_holds(emulator: Emulator, run: Run) -> None:
+async def test_a_limp_arm_falls_and_a_frozen_arm_holds(emulator: Emulator, run: Run) -> None:
     async with driver_of(run) as driver:
         emulator.set(emulator.parse_faults("base frozen"))
         await until(lambda: driver.problem != "")

@@ -50,6 +50,6 @@ def test_every_module_imports_without_posix_modules() -> None:
     assert (done.stdout.strip(), done.stderr) == ("", "")
 
 
-def test_a_missing_module_says_so_when_it_is_used() -> None:
+def test_a_missing_posix_module_is_reported_on_use() -> None:
     with pytest.raises(Unsupported, match=r"^fcntl\.flock needs Linux or macOS$"):
         _Missing("fcntl").flock()

@@ -1,4 +1,4 @@
-"""Packages of `gigabrain process new`: they run, and their test passes, as written."""
+"""Packages of `gigabrain process new`: they run unchanged, and their own test passes."""
 
 import asyncio
 import os
@@ -39,7 +39,7 @@ def install(folder: Path, site: Path) -> None:
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_its_own_test_passes(kind: Kind, tmp_path: Path) -> None:
+def test_the_test_of_a_new_package_passes(kind: Kind, tmp_path: Path) -> None:
     folder = write_package(kind, "red_lamp", tmp_path)
     assert folder.name == f"red-lamp-{kind}"
     ran = subprocess.run(
@@ -54,7 +54,7 @@ def test_its_own_test_passes(kind: Kind, tmp_path: Path) -> None:
     assert "1 passed" in ran.stdout
 
 
-def test_each_kind_is_found_by_its_name(tmp_path: Path, site: Path) -> None:
+def test_each_kind_of_package_is_found_by_its_name(tmp_path: Path, site: Path) -> None:
     for kind in KINDS:
         install(write_package(kind, f"lamp_{kind}", tmp_path), site)
     assert process_type("lamp_process").writes == ("robot/lamp_process/**",)
@@ -66,7 +66,7 @@ def test_a_bad_name_is_refused_and_nothing_is_overwritten(tmp_path: Path) -> Non
     with pytest.raises(ConfigError, match="expected lower-case letters"):
         write_package("process", "Red-Lamp", tmp_path)
     with pytest.raises(ConfigError, match="expected lower-case letters"):
-        write_package("behaviour", "none", tmp_path)  # `class None` is none
+        write_package("behaviour", "none", tmp_path)  # `class None` is invalid
     folder = write_package("process", "lamp", tmp_path)
     (folder / "README.md").write_text("mine")
     with pytest.raises(ConfigError, match="exists; nothing was written"):
@@ -79,21 +79,21 @@ def test_a_bad_name_is_refused_and_nothing_is_overwritten(tmp_path: Path) -> Non
     [
         ("process", "camera"),
         ("process", "safety"),
-        ("process", "world"),  # a setting of deployment files
-        ("process", "map"),  # a topic, below which it could write nothing of its own
+        ("process", "world"),  # also a key of deployment files
+        ("process", "map"),  # also a topic
         ("process", "health"),
         ("process", "goal"),
         ("perceptor", "camera"),
         ("behaviour", "avoid"),
     ],
 )
-def test_a_name_that_is_taken_is_refused(kind: Kind, name: str, tmp_path: Path) -> None:
+def test_a_name_in_use_is_refused(kind: Kind, name: str, tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=f"the name '{name}' is taken; choose another"):
         write_package(kind, name, tmp_path)
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_name_of_another_kind_is_free(tmp_path: Path) -> None:
+def test_a_name_used_by_another_kind_is_accepted(tmp_path: Path) -> None:
     assert write_package("behaviour", "camera", tmp_path).is_dir()
     assert write_package("process", "avoid", tmp_path).is_dir()
 
@@ -104,11 +104,11 @@ async def test_a_new_process_runs_on_a_robot_as_its_readme_says(tmp_path: Path) 
     install(write_package("process", "lamp", tmp_path), site)
 
     class HomeWithLamp(Home):
-        """A user's folders, where the package is installed."""
+        """A home folder where the package is installed."""
 
         @property
         def environment(self) -> dict[str, str]:
-            """The environment of its processes."""
+            """Return the environment of its processes."""
             found = super().environment
             return found | {"PYTHONPATH": f"{found['PYTHONPATH']}{os.pathsep}{site}"}
 

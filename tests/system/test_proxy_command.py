@@ -1,4 +1,4 @@
-"""The command `gigabrain proxy`: it spoils what it is told to, and refuses what it cannot do."""
+"""The command `gigabrain proxy`: it causes the requested faults, and refuses impossible ones."""
 
 import asyncio
 import signal
@@ -17,7 +17,7 @@ async def server() -> AsyncIterator[tuple[Server, int]]:
         yield made
 
 
-async def test_the_command_spoils_a_line_as_it_is_told(
+async def test_the_command_causes_the_requested_faults(
     home: Home, server: tuple[Server, int]
 ) -> None:
     command = home.start("proxy", f"tcp/127.0.0.1:{server[1]}", "--chaos", "down hole")
@@ -26,7 +26,7 @@ async def test_the_command_spoils_a_line_as_it_is_told(
     reader, writer = await asyncio.open_connection(host, int(port))
     writer.write(b"question")
     await asyncio.sleep(0.1)
-    assert server[0].received == b""  # no connection comes about through a hole
+    assert server[0].received == b""  # a hole lets no connection through
     command.send(signal.SIGINT)
     assert await command.ended() == 130
     with pytest.raises(ConnectionResetError):
@@ -42,7 +42,7 @@ async def test_the_command_spoils_a_line_as_it_is_told(
         (("tcp/127.0.0.1:7447", "--chaos", "hol"), "no fault 'hol'; did you mean 'hole'?"),
     ],
 )
-async def test_the_command_refuses_what_it_cannot_do(
+async def test_impossible_options_are_refused(
     home: Home, arguments: tuple[str, ...], complaint: str
 ) -> None:
     command = await home.run("proxy", *arguments)

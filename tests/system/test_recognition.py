@@ -1,4 +1,4 @@
-"""A robot that recognises: beside its brain, also after its process died or hung."""
+"""A robot with recognition, also after its process died or hung."""
 
 import os
 import signal
@@ -24,7 +24,7 @@ tags: [{id: 7, at: [1.49, 0.1], yaw: 3.1416, z: 0.25, size: 0.2}]
 
 @pytest.mark.skipif(not can_draw(), reason="there is no OpenGL here")
 @pytest.mark.slow
-async def test_tags_are_seen_also_after_the_process_died_or_hung_and_the_robot_drives_on(
+async def test_tags_are_found_again_after_the_process_died_or_hung(
     home: Home,
 ) -> None:
     world = home.folder / "tags.yaml"
@@ -59,7 +59,7 @@ async def test_tags_are_seen_also_after_the_process_died_or_hung_and_the_robot_d
     assert await demo.ended() == 0
 
 
-async def test_a_net_that_is_missing_is_refused_in_one_line_before_anything_starts(
+async def test_a_missing_net_is_refused_in_one_line_before_the_start(
     home: Home,
 ) -> None:
     (home.folder / "coco.txt").write_text("can\n")

@@ -1,4 +1,4 @@
-"""The recorder's disk: slow, full, or gone with the process, it never makes the robot wait."""
+"""The recorder never delays the robot: with a slow or full disk, or when it is killed."""
 
 import os
 import random
@@ -25,7 +25,7 @@ from tests.unit.recording.bags import QUICK, kept, wait
 
 
 class SlowTape(AppendOnlyFile):
-    """A disk that takes 1 MB a second."""
+    """A file on a disk that writes 1 MB a second."""
 
     def append(self, data: bytes) -> None:
         time.sleep(len(data) / 1e6)
@@ -33,7 +33,7 @@ class SlowTape(AppendOnlyFile):
 
 
 class FullTape(AppendOnlyFile):
-    """A disk that is full from time to time."""
+    """A file on a disk that is full while `full` is set."""
 
     full = False
 
@@ -47,7 +47,7 @@ class FullTape(AppendOnlyFile):
         super().append(data)
 
 
-def test_on_a_slow_disk_what_is_written_and_what_was_dropped_is_what_came(
+def test_on_a_slow_disk_written_and_dropped_messages_add_up(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(bag_writer, "AppendOnlyFile", SlowTape)
@@ -55,7 +55,7 @@ def test_on_a_slow_disk_what_is_written_and_what_was_dropped_is_what_came(
     config = RecorderConfig(viewers=False, flush_s=0.05, keep_free_mb=0, queue_mb=0.3)
     with Recorder(path, config) as recorder:
         count = 0
-        while recorder.status().dropped < 500:  # of 1.5 kB that do not compress
+        while recorder.status().dropped < 500:  # messages of 1.5 kB that do not compress
             count += 1
             recorder.intake.receive("robot/scan", "", bags.scan(count))
     status = recorder.status()
@@ -68,12 +68,12 @@ def test_on_a_slow_disk_what_is_written_and_what_was_dropped_is_what_came(
 
 
 def test_the_bus_never_waits_for_the_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    stood, gate = threading.Event(), threading.Event()
+    hung, gate = threading.Event(), threading.Event()
 
     class StuckTape(AppendOnlyFile):
         def append(self, data: bytes) -> None:
             if self.size > 1000:
-                stood.set()
+                hung.set()
                 gate.wait()
             super().append(data)
 
@@ -81,20 +81,20 @@ def test_the_bus_never_waits_for_the_disk(tmp_path: Path, monkeypatch: pytest.Mo
     config = RecorderConfig(viewers=False, flush_s=0.01, keep_free_mb=0, queue_mb=0.1)
     with Recorder(tmp_path / "stuck.mcap", config) as recorder:
         first = 0
-        while not stood.wait(0.01):  # until the disk stands still
+        while not hung.wait(0.01):  # until the disk hangs
             first += 1
             recorder.intake.receive("robot/scan", "", bags.scan(first))
         for seq in range(first + 1, first + 1001):
             recorder.intake.receive("robot/scan", "", bags.scan(seq))
         stuck = recorder.status()
         gate.set()
-    assert stuck.seen == first + 1000  # all were taken while the disk stood still
-    assert stuck.dropped > 850  # twice the queue's room at most was not
+    assert stuck.seen == first + 1000  # all are accepted while the disk hangs
+    assert stuck.dropped > 850  # at most two full queues are kept
     status = recorder.status()
     assert status.written + status.dropped == first + 1000
 
 
-def test_the_first_message_of_a_key_that_a_full_disk_refuses_counts_as_dropped(
+def test_the_first_message_of_a_key_on_a_full_disk_counts_as_dropped(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(bag_writer, "AppendOnlyFile", FullTape)
@@ -108,7 +108,7 @@ def test_the_first_message_of_a_key_that_a_full_disk_refuses_counts_as_dropped(
     assert (recorder.status().written, recorder.status().dropped) == (1, 1)
 
 
-def test_a_full_disk_costs_what_comes_meanwhile_and_recording_goes_on_in_a_new_file(
+def test_after_a_full_disk_recording_goes_on_in_a_new_file(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(bag_writer, "AppendOnlyFile", FullTape)
@@ -126,9 +126,7 @@ def test_a_full_disk_costs_what_comes_meanwhile_and_recording_goes_on_in_a_new_f
         try:
             send(101, 100)
             wait(recorder, lambda now: now.written + now.dropped == 200)
-            wait(
-                recorder, lambda now: "No space left on device" in now.fault
-            )  # it tries again and again
+            wait(recorder, lambda now: "No space left on device" in now.fault)  # it keeps retrying
         finally:
             FullTape.full = False
         time.sleep(0.05)
@@ -143,7 +141,7 @@ def test_a_full_disk_costs_what_comes_meanwhile_and_recording_goes_on_in_a_new_f
     assert read_info(second).finished
 
 
-def test_what_must_stay_free_of_the_disk_stays_free(tmp_path: Path) -> None:
+def test_the_reserved_disk_space_is_not_used(tmp_path: Path) -> None:
     config = RecorderConfig(viewers=False, flush_s=0.02, keep_free_mb=1e9)
     with Recorder(tmp_path / "a.mcap", config) as recorder:
         recorder.intake.receive("robot/state", "", bags.state(1))
@@ -160,7 +158,7 @@ def test_a_recording_is_split_by_size_and_each_part_has_the_map(tmp_path: Path) 
         recorder.intake.receive("robot/map", "", grid)
         for seq in range(1, 301):
             recorder.intake.receive("robot/scan", "", bags.scan(seq))
-            if seq % 20 == 0:  # 30 kB, more than a quarter of the queue, so it is written at once
+            if seq % 20 == 0:  # 30 kB, over a quarter of the queue, are written at once
                 wait(recorder, lambda now, seq=seq: now.written > seq - 10)
     paths = [tmp_path / name for name in ("s.mcap", "s_1.mcap", "s_2.mcap", "s_3.mcap")]
     assert recorder.status().files >= 4
@@ -197,8 +195,8 @@ with Recorder(Path(sys.argv[1]), RecorderConfig(viewers=False, keep_free_mb=0)) 
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_killed_at_any_moment_it_loses_less_than_half_a_second(tmp_path: Path, seed: int) -> None:
-    """Of messages that come 5 ms apart or, on a busy machine, more."""
+def test_a_killed_recorder_loses_less_than_half_a_second(tmp_path: Path, seed: int) -> None:
+    """The messages are 5 ms apart, or more on a busy machine."""
     path = tmp_path / "killed.mcap"
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
     with subprocess.Popen(
@@ -207,12 +205,12 @@ def test_killed_at_any_moment_it_loses_less_than_half_a_second(tmp_path: Path, s
         assert process.stdout
         stop = 150 + random.Random(seed).randrange(100)
         for line in process.stdout:
-            told = int(line)
-            if told == stop:
+            newest = int(line)
+            if newest == stop:
                 process.send_signal(signal.SIGKILL)
     seqs = bags.seqs(path)
     assert seqs == list(range(1, seqs[-1] + 1))
-    assert told - seqs[-1] <= 100
+    assert newest - seqs[-1] <= 100
 
 
 LIMITED = """
@@ -236,14 +234,14 @@ print(now.seen, now.written, now.dropped)
 
 
 @pytest.mark.skipif(not hasattr(resource, "RLIMIT_FSIZE"), reason="no limit on file sizes here")
-def test_a_disk_that_truly_takes_no_more_is_survived(tmp_path: Path) -> None:
+def test_a_file_size_limit_of_the_system_is_handled_as_a_full_disk(tmp_path: Path) -> None:
     path = tmp_path / "limited.mcap"
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
-    told = subprocess.run(
+    done = subprocess.run(
         (sys.executable, "-c", LIMITED, str(path)),
         capture_output=True, text=True, env=environment,
     )  # fmt: skip
-    assert "cannot write" in told.stderr
-    seen, written, dropped = map(int, told.stdout.split())
+    assert "cannot write" in done.stderr
+    seen, written, dropped = map(int, done.stdout.split())
     assert seen == 100 == written + dropped
     assert 20 < len(bags.seqs(path, "robot/scan")) == written < 100

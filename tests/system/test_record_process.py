@@ -19,7 +19,7 @@ def sizes(folder: Path) -> dict[str, int]:
 
 
 @pytest.mark.slow
-async def test_a_recorder_that_is_killed_costs_the_robot_nothing_and_its_file_is_mended(
+async def test_a_killed_recorder_does_not_affect_the_robot_and_its_file_is_recovered(
     home: Home,
 ) -> None:
     folder = home.folder / "bags"

@@ -1,4 +1,4 @@
-"""A host's own router: who has one, and that the robot is as safe with it as without."""
+"""A relay, the router of a second host: which hosts have one, and that the robot stays safe."""
 
 import os
 import signal
@@ -17,7 +17,7 @@ from gigabrain_zenoh.runtime import audit
 from gigabrain_zenoh.security.authority import issue, new_fleet
 from gigabrain_zenoh.testing.processes import Home, free_port
 from gigabrain_zenoh.testing.waiting import until
-from tests.system.test_netns import REST_TICKS, STOP_TICKS, Ears
+from tests.system.test_netns import REST_TICKS, STOP_TICKS, BusRecorder
 
 ROBOT: tuple[str, ...] = ("router", "driver", "control", "safety")
 BRAIN: tuple[str, ...] = ("perception", "decision")
@@ -40,14 +40,14 @@ def configs(deployment: Deployment, host: str, folder: Path) -> dict[str, Proces
         (("router", "perception", "decision"), False),
     ],
 )
-def test_a_host_with_perception_and_decision_and_neither_router_nor_body_has_a_relay(
+def test_a_host_with_only_perception_and_decision_has_a_relay(
     processes: tuple[str, ...], relayed: bool, tmp_path: Path
 ) -> None:
     made = configs(Deployment(hosts={"here": processes}), "here", tmp_path)
     assert set(made) == {*processes, "relay"} if relayed else set(processes)
 
 
-def test_its_processes_meet_at_a_socket_and_it_alone_connects_to_the_router(
+def test_only_the_relay_connects_to_the_router_and_others_use_its_socket(
     tmp_path: Path,
 ) -> None:
     deployment = Deployment(
@@ -62,10 +62,10 @@ def test_its_processes_meet_at_a_socket_and_it_alone_connects_to_the_router(
     assert list(made) == ["relay", "perception", "decision"]
 
 
-async def relay_lost(robot: Probe, *, killed: bool) -> None:
-    """With it the brain is lost, which stops the robot; and it comes back by itself."""
+async def assert_stops_without_relay(robot: Probe, *, killed: bool) -> None:
+    """Kill or freeze the relay; assert that the robot stops, and drives again by itself."""
     relay = await robot.pid("relay")
-    ears = Ears(robot)
+    recorder = BusRecorder(robot)
     await robot.driving_straight(0.19)
     start = robot.state
     os.kill(relay, signal.SIGKILL if killed else signal.SIGSTOP)
@@ -73,11 +73,11 @@ async def relay_lost(robot: Probe, *, killed: bool) -> None:
     if not killed:
         os.kill(relay, signal.SIGCONT)
     await robot.driving_straight(0.15, room=0.0)
-    last, first = ears.silence(start.tick)
+    last, first = recorder.silence(start.tick)
     assert first - last > STOP_TICKS
-    late = [c.linear_x for c in ears.commands if last + STOP_TICKS <= c.tick < first]
+    late = [c.linear_x for c in recorder.commands if last + STOP_TICKS <= c.tick < first]
     assert late
-    assert all(speed < 0.19 for speed in late)  # slower than it drove, from the first one on
+    assert all(speed < 0.19 for speed in late)  # the robot slows down from the first one on
     stood = [s for s in robot.states if last + REST_TICKS <= s.tick < first]
     assert all(map(at_rest, stood))
     truth = await robot.truth()
@@ -92,7 +92,7 @@ async def relay_lost(robot: Probe, *, killed: bool) -> None:
         pytest.param(True, id="with keys in a fleet"),
     ],
 )
-async def test_a_robot_whose_brain_loses_its_relay_stops_and_drives_again_and_nobody_is_refused(
+async def test_a_robot_whose_brain_loses_its_relay_stops_and_drives_again(
     secure: bool, tmp_path: Path
 ) -> None:
     values: dict[str, object] = {
@@ -116,15 +116,15 @@ async def test_a_robot_whose_brain_loses_its_relay_stops_and_drives_again_and_no
         robots.start("up", file, "--host", "robot")
         where = Endpoint(connect=(str(values["router"]),), keys=operator, namespace=namespace)
         async with probing(where) as robot:
-            await relay_lost(robot, killed=False)
-            await relay_lost(robot, killed=True)
+            await assert_stops_without_relay(robot, killed=False)
+            await assert_stops_without_relay(robot, killed=True)
             for name in ("relay", *BRAIN):
                 answers = await robot.bus.ask(DESCRIBE, DescribeRequest(), name=name, timeout_s=20)
                 assert len(answers) == 1, name
             pressed = await brains.run("estop")
             assert "NOT CONFIRMED" not in pressed.out
             assert "CONFIRMED" in pressed.out
-            await robot.ticks(75)  # the router's audit is on the disk by then
+            await robot.ticks(75)  # until the audit of the router is on disk
         folder = robots.folder / "state" / "gigabrain" / "robots"
         folder /= namespace or "turtlebot3_waffle"
         audited = {record.what for record in audit.read_audit(folder, 1000)}

@@ -1,6 +1,6 @@
-"""The emulated RPLIDAR as other people's clients see it, over a real pty.
+"""The emulated RPLIDAR with third-party clients, over a real pty.
 
-Allowed for: both drive the DTR line, which a pty has not; rplidar-roboticia takes express samples
+Known differences: both use the DTR line, which a pty lacks; rplidar-roboticia reads express samples
 one too late; pyrplidar swaps the bytes of dense ones.
 """
 
@@ -45,11 +45,11 @@ def options(folder: Path, model: Any) -> RplidarOptions:
 @contextlib.asynccontextmanager
 async def booted(its: RplidarOptions) -> AsyncIterator[None]:
     async with emulated(RplidarDevice, its):
-        await asyncio.sleep(0.1)  # until its banner has been said, to nobody
+        await asyncio.sleep(0.1)  # until its banner was sent
         yield
 
 
-def wrong(points: Iterable[Point]) -> tuple[int, int]:
+def count_wrong(points: Iterable[Point]) -> tuple[int, int]:
     """Return the number of points with a range, and of those that the simulation contradicts."""
     expected, seen, off = truth(), 0, 0
     for angle, distance in points:
@@ -89,8 +89,10 @@ def with_roboticia(port: str, scan_type: str) -> tuple[Any, list[Point]]:
     return facts, points
 
 
-@pytest.mark.parametrize("mode", [None, 1])  # standard, and its express mode
-async def test_pyrplidar_knows_an_a1_and_reads_its_scans(mode: int | None, tmp_path: Path) -> None:
+@pytest.mark.parametrize("mode", [None, 1])  # standard and express mode
+async def test_pyrplidar_identifies_an_a1_and_reads_its_scans(
+    mode: int | None, tmp_path: Path
+) -> None:
     its = options(tmp_path, "a1")
     async with booted(its):
         facts, points = await asyncio.to_thread(with_pyrplidar, its.port, 115_200, mode)
@@ -105,12 +107,12 @@ async def test_pyrplidar_knows_an_a1_and_reads_its_scans(mode: int | None, tmp_p
         ("Express", 0x82, 250, 12),
     ]
     assert typical == 1
-    seen, off = wrong(points)
+    seen, off = count_wrong(points)
     assert seen > 300
     assert off <= 0.01 * seen
 
 
-async def test_pyrplidar_reads_the_dense_scans_of_a_c1_once_its_bytes_are_swapped_back(
+async def test_pyrplidar_reads_dense_scans_of_a_c1_with_swapped_bytes(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def cabin(self: Any, raw: bytes) -> None:
@@ -121,12 +123,14 @@ async def test_pyrplidar_reads_the_dense_scans_of_a_c1_once_its_bytes_are_swappe
     async with booted(its):
         _, points = await asyncio.to_thread(with_pyrplidar, its.port, 460_800, 1)
 
-    seen, off = wrong(points)
+    seen, off = count_wrong(points)
     assert seen > 300
     assert off <= 0.01 * seen
 
 
-async def test_rplidar_roboticia_knows_an_a1_and_reads_its_standard_scans(tmp_path: Path) -> None:
+async def test_rplidar_roboticia_identifies_an_a1_and_reads_its_standard_scans(
+    tmp_path: Path,
+) -> None:
     its = options(tmp_path, "a1")
     async with booted(its):
         (info, health), points = await asyncio.to_thread(with_roboticia, its.port, "normal")
@@ -138,12 +142,12 @@ async def test_rplidar_roboticia_knows_an_a1_and_reads_its_standard_scans(tmp_pa
         "serialnumber": "0123456789ABCDEF0123456789ABCDEF",
     }
     assert health == ("Good", 0)
-    seen, off = wrong(points)
+    seen, off = count_wrong(points)
     assert seen > 300
     assert off <= 0.01 * seen
 
 
-async def test_rplidar_roboticia_reads_express_scans_once_each_is_taken_one_sample_earlier(
+async def test_rplidar_roboticia_reads_express_scans_shifted_by_one_sample(
     tmp_path: Path,
 ) -> None:
     its = options(tmp_path, "a1")
@@ -151,6 +155,6 @@ async def test_rplidar_roboticia_reads_express_scans_once_each_is_taken_one_samp
         _, points = await asyncio.to_thread(with_roboticia, its.port, "express")
 
     step = 360 * 10 / 4000
-    seen, off = wrong([(math.fmod(angle - step + 360, 360), d) for angle, d in points])
+    seen, off = count_wrong([(math.fmod(angle - step + 360, 360), d) for angle, d in points])
     assert seen > 300
     assert off <= 0.01 * seen

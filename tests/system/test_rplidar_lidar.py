@@ -42,9 +42,9 @@ def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
     [
         ("a1", "standard", STANDARD),
         ("a1", "auto", EXPRESS),
-        ("a2m8", "auto", EXPRESS),  # whose motor an accessory board powers
+        ("a2m8", "auto", EXPRESS),  # an accessory board powers its motor
         ("c1", "auto", DENSE),
-        ("s2", "auto", DENSE),  # whose speed is commanded
+        ("s2", "auto", DENSE),  # its speed is commanded
         ("s2", "standard", STANDARD),
     ],
 )
@@ -60,7 +60,8 @@ async def test_a_scan_of_each_model_is_the_scan_of_the_simulation(
         assert device._mode is not None
         assert device._mode.kind == kind
         missing = int(np.isnan(scan.ranges_m).sum())
-        assert missing <= (165 if kind == STANDARD and model == "a1" else 0)  # 200 samples a turn
+        # standard scans of an A1 have 200 samples per turn
+        assert missing <= (165 if kind == STANDARD and model == "a1" else 0)
         assert agree(scan, truth()) > 0.97 - missing / 360
         await until(lambda: listener.source.health.connected)
         assert listener.source.health.errors == 0
@@ -85,14 +86,14 @@ async def test_a_lidar_that_was_unplugged_is_started_again(tmp_path: Path) -> No
         await listener.more(1)
         station.set(Faults(unplugged=True))
         await until(lambda: not listener.source.link.connected)
-        station.device.reset()  # it has lost its power with its cable
+        station.device.reset()  # it loses power with its cable
         station.set(NO_FAULTS)
 
         await listener.more(2)
         assert listener.source.health.reconnects >= 1
 
 
-async def test_where_the_model_is_left_open_the_baud_rates_are_tried_in_turn(
+async def test_without_a_model_the_baud_rates_are_tried_in_turn(
     tmp_path: Path,
 ) -> None:
     its = options(tmp_path)
@@ -121,7 +122,7 @@ async def test_where_the_model_is_left_open_the_baud_rates_are_tried_in_turn(
         ),
     ],
 )
-async def test_another_lidar_on_the_port_is_named_once(
+async def test_another_lidar_on_the_port_is_reported_once(
     settings: dict[str, Any], expected: str, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     its = options(tmp_path, **settings)
@@ -132,12 +133,12 @@ async def test_another_lidar_on_the_port_is_named_once(
         assert len(caplog.records) == 1
 
 
-async def test_a_wrong_model_means_a_wrong_baud_rate_and_so_silence_which_is_reported(
+async def test_a_wrong_model_with_another_baud_rate_is_reported_as_silence(
     tmp_path: Path,
 ) -> None:
     its = options(tmp_path, model="a1")
     async with emulated(RplidarDevice, its) as station:
-        await asyncio.sleep(0.1)  # until its banner has been said
+        await asyncio.sleep(0.1)  # until its banner was sent
         station.set(Faults(deaf=True))
         async with listen(its) as listener:
             await until(lambda: listener.source.problem)
@@ -147,7 +148,7 @@ async def test_a_wrong_model_means_a_wrong_baud_rate_and_so_silence_which_is_rep
             )
 
 
-async def test_another_model_than_the_file_names_is_reported_in_one_line(
+async def test_another_model_than_in_the_file_is_reported_in_one_line(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     caplog.set_level(logging.INFO)
@@ -156,12 +157,12 @@ async def test_another_model_than_the_file_names_is_reported_in_one_line(
         listen(options(tmp_path, model="a1")) as listener,
     ):
         await listener.more(1)
-        said = [record.message for record in caplog.records]
-        assert f"RPLIDAR A2 on {tmp_path}/scan, firmware 1.29" in said
-        assert f"the lidar on {tmp_path}/scan is an RPLIDAR A2, not model: a1" in said
+        logged = [record.message for record in caplog.records]
+        assert f"RPLIDAR A2 on {tmp_path}/scan, firmware 1.29" in logged
+        assert f"the lidar on {tmp_path}/scan is an RPLIDAR A2, not model: a1" in logged
 
 
-async def test_a_lidar_that_has_stopped_to_protect_itself_is_reset(
+async def test_a_lidar_in_protection_stop_is_reset(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     its = options(tmp_path, model="c1")
@@ -183,7 +184,7 @@ async def test_closing_stops_the_measurement_and_the_motor(tmp_path: Path) -> No
         assert station.device._mode is None
 
 
-async def test_the_motor_of_an_a1_turns_while_its_terminal_ready_line_is_cleared(
+async def test_the_motor_of_an_a1_turns_while_dtr_is_cleared(
     tmp_path: Path,
 ) -> None:
     its, line = options(tmp_path, model="a1"), list[bool]()
@@ -197,7 +198,7 @@ async def test_the_motor_of_an_a1_turns_while_its_terminal_ready_line_is_cleared
 @pytest.mark.parametrize(
     ("device", "expected"), [(RplidarDevice, (True, False)), (LdDevice, (False, True))]
 )
-async def test_each_lidar_knows_its_own_port(
+async def test_each_lidar_is_recognised_by_its_reply(
     device: Any, expected: tuple[bool, bool], tmp_path: Path
 ) -> None:
     its = options(tmp_path)

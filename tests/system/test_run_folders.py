@@ -1,4 +1,4 @@
-"""Old run folders are removed, but never one that is in use."""
+"""Old run folders are removed unless they are in use."""
 
 import subprocess
 import sys
@@ -7,7 +7,7 @@ from pathlib import Path
 from gigabrain_zenoh.host import run_folders
 
 
-def runs(base: Path, count: int, size: int = 10) -> list[Path]:
+def make_runs(base: Path, count: int, size: int = 10) -> list[Path]:
     made = [base / f"2026010{i}T000000Z-demo-{i}" for i in range(count)]
     for path in made:
         (path / "state").mkdir(parents=True)
@@ -15,15 +15,15 @@ def runs(base: Path, count: int, size: int = 10) -> list[Path]:
     return made
 
 
-HOLDS = (
+HOLD_FOLDER = (
     "import sys; from pathlib import Path; from gigabrain_zenoh.host import run_folders; "
     "run_folders.hold(Path(sys.argv[1])); print('held', flush=True); sys.stdin.read()"
 )
 
 
-def test_the_folder_of_a_living_run_stays_and_that_of_a_killed_one_goes(tmp_path: Path) -> None:
-    made = runs(tmp_path, 3)
-    words = (sys.executable, "-c", HOLDS, str(made[0]))
+def test_only_folders_of_ended_runs_are_removed(tmp_path: Path) -> None:
+    made = make_runs(tmp_path, 3)
+    words = (sys.executable, "-c", HOLD_FOLDER, str(made[0]))
     with subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as living:
         assert living.stdout
         assert living.stdout.readline() == b"held\n"

@@ -1,4 +1,4 @@
-"""Programs of the host that missions run: started there, ended, and refused."""
+"""Programs on the host that missions run: they are started, ended, or refused."""
 
 import asyncio
 import os
@@ -18,7 +18,7 @@ from gigabrain_zenoh.runtime.child import supervised_environment
 from gigabrain_zenoh.testing.waiting import until
 
 
-def test_nothing_is_written_where_there_is_no_folder() -> None:
+def test_without_a_scripts_folder_nothing_is_created() -> None:
     file = TaskFile("")
     assert file.read() == (Saved(), "")
     assert file.write((Saved(count=3),)) == ""
@@ -37,7 +37,7 @@ async def ended(run: Run) -> tuple[bool, str]:
     return run.result
 
 
-async def test_a_program_of_the_folder_is_run_there_with_its_arguments(tmp_path: Path) -> None:
+async def test_a_program_runs_in_its_folder_with_its_arguments(tmp_path: Path) -> None:
     folder = program(tmp_path, 'echo "$1 in $(pwd)"')
     run = Scripts(folder).start(Script(run="beep", arguments=("twice",)))
     assert await ended(run) == (True, f"ended well: twice in {tmp_path}")
@@ -59,15 +59,15 @@ async def test_a_program_may_open_windows(
     monkeypatch.setenv("MUJOCO_GL", before or "")
     if before is None:
         monkeypatch.delenv("MUJOCO_GL")
-    monkeypatch.setenv("GIGABRAIN_MUJOCO_GL", "")  # so that it is put back afterwards
+    monkeypatch.setenv("GIGABRAIN_MUJOCO_GL", "")  # restored after the test
     monkeypatch.delenv("GIGABRAIN_MUJOCO_GL")
-    for _ in range(2):  # in a process, and in the one that it was forked from
+    for _ in range(2):  # in a process, and in the one it was forked from
         this_process.open_no_window()
     folder = program(tmp_path, 'echo "${MUJOCO_GL:-any}"')
     assert await ended(Scripts(folder).start(Script(run="beep"))) == (True, f"ended well: {then}")
 
 
-def test_a_process_of_ours_imports_nothing_for_windows() -> None:
+def test_our_processes_import_no_windowing_library() -> None:
     code = """
 import sys
 from gigabrain_zenoh.config.settings import Endpoint, ProcessConfig
@@ -81,7 +81,7 @@ print("glfw" in sys.modules)
 
 
 @pytest.mark.parametrize("chosen", ["osmesa", "nonsense"])
-def test_a_process_of_ours_does_not_import_missing_graphics_that_were_chosen(chosen: str) -> None:
+def test_our_processes_do_not_import_missing_graphics(chosen: str) -> None:
     code = """
 import ctypes.util
 ctypes.util.find_library = lambda name: None
@@ -98,9 +98,7 @@ print(chosen_graphics(), "mujoco.osmesa" in sys.modules)
 
 
 @pytest.mark.parametrize("chosen", ["osmesa", "nonsense"])
-def test_a_command_that_draws_without_its_graphics_ends_in_one_line(
-    tmp_path: Path, chosen: str
-) -> None:
+def test_a_drawing_command_without_graphics_fails_in_one_line(tmp_path: Path, chosen: str) -> None:
     command = [sys.executable, "-c", "from gigabrain_zenoh.cli.app import main; main()"]
     ended = subprocess.run(
         [*command, "render", str(tmp_path / "x.png"), "--world", "arena"],
@@ -109,25 +107,25 @@ def test_a_command_that_draws_without_its_graphics_ends_in_one_line(
         text=True,
         check=False,
     )
-    if ended.returncode:  # no other graphics, or none at all
+    if ended.returncode:  # other graphics are missing too
         assert (ended.returncode, ended.stderr.count("\n")) == (2, 1)
         assert "apt-get install" in ended.stderr
     else:
         assert (tmp_path / "x.png").exists()
 
 
-def test_a_process_of_ones_own_has_the_graphics_that_were_chosen(
+def test_a_users_process_has_the_chosen_graphics(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setenv("MUJOCO_GL", "osmesa")
-    monkeypatch.setenv("GIGABRAIN_MUJOCO_GL", "")  # so that it is put back afterwards
+    monkeypatch.setenv("GIGABRAIN_MUJOCO_GL", "")  # restored after the test
     this_process.open_no_window()
     assert supervised_environment()["MUJOCO_GL"] == "osmesa"
 
 
 @pytest.mark.parametrize("chosen", ["egl", "glfw"])
 @pytest.mark.parametrize("found", [True, False])
-def test_graphics_that_are_installed_are_left_to_those_who_draw(
+def test_the_choice_of_installed_graphics_is_kept(
     monkeypatch: pytest.MonkeyPatch, chosen: str, found: bool
 ) -> None:
     for finder in ("ctypes.util.find_library", "importlib.util.find_spec"):
@@ -140,12 +138,12 @@ def test_graphics_that_are_installed_are_left_to_those_who_draw(
     assert this_process.chosen_graphics() == chosen
 
 
-async def test_a_program_that_fails_says_why(tmp_path: Path) -> None:
+async def test_a_failing_program_reports_its_error(tmp_path: Path) -> None:
     run = Scripts(program(tmp_path, "echo no sound >&2; exit 3")).start(Script(run="beep"))
     assert await ended(run) == (False, "ended with exit code 3: no sound")
 
 
-def test_a_program_ends_on_uvloop_too(tmp_path: Path) -> None:
+def test_a_program_can_be_ended_on_uvloop_too(tmp_path: Path) -> None:
     uvloop = pytest.importorskip("uvloop")
     scripts = Scripts(program(tmp_path, "echo no sound; exit 3"))
 
@@ -156,7 +154,7 @@ def test_a_program_ends_on_uvloop_too(tmp_path: Path) -> None:
         assert runner.run(run()) == (False, "ended with exit code 3: no sound")
 
 
-async def test_a_program_that_takes_too_long_is_ended_with_all_it_has_started(
+async def test_a_program_that_takes_too_long_is_ended_with_its_children(
     tmp_path: Path,
 ) -> None:
     text = f"sleep 600 & echo $! > {tmp_path}/child; wait"
@@ -167,24 +165,24 @@ async def test_a_program_that_takes_too_long_is_ended_with_all_it_has_started(
     await until(lambda: _gone(child))
 
 
-async def test_what_a_program_leaves_behind_ends_with_it(tmp_path: Path) -> None:
+async def test_children_of_a_program_end_with_it(tmp_path: Path) -> None:
     run = Scripts(program(tmp_path, "sleep 600 & echo $!")).start(Script(run="beep"))
-    well, said = await ended(run)
-    assert well
-    await until(lambda: _gone(int(said.rpartition(" ")[2])))
+    ok, output = await ended(run)
+    assert ok
+    await until(lambda: _gone(int(output.rpartition(" ")[2])))
 
 
-async def test_who_leaves_a_programs_group_does_not_hold_its_result_up(tmp_path: Path) -> None:
+async def test_a_child_in_another_group_does_not_delay_the_result(tmp_path: Path) -> None:
     text = "import os, signal; os.setsid(); print(os.getpid()); signal.pause()"
     wait = "while [ ! -s left ]; do sleep 0.01; done; cat left"
     lines = f'{sys.executable} -uc "{text}" 2>&1 >left & {wait}'
     run = Scripts(program(tmp_path, lines)).start(Script(run="beep"))
-    well, said = await ended(run)
-    os.kill(int(said.rpartition(" ")[2]), signal.SIGKILL)
-    assert well
+    ok, output = await ended(run)
+    os.kill(int(output.rpartition(" ")[2]), signal.SIGKILL)
+    assert ok
 
 
-async def test_a_program_that_is_paused_goes_on_when_resumed_and_has_its_time_left(
+async def test_a_paused_program_resumes_with_its_remaining_time(
     tmp_path: Path,
 ) -> None:
     os.mkfifo(tmp_path / "go")
@@ -202,7 +200,7 @@ async def test_a_program_that_is_paused_goes_on_when_resumed_and_has_its_time_le
     assert await ended(run) == (True, "ended well")
 
 
-async def test_a_program_that_is_paused_while_it_starts_has_not_begun(tmp_path: Path) -> None:
+async def test_a_program_paused_during_its_start_does_not_begin(tmp_path: Path) -> None:
     run = Scripts(program(tmp_path, f"touch {tmp_path}/begun")).start(Script(run="beep"))
     run.pause()
     await until(lambda: run._program)
@@ -211,7 +209,7 @@ async def test_a_program_that_is_paused_while_it_starts_has_not_begun(tmp_path: 
     assert await ended(run) == (True, "ended well")
 
 
-async def test_a_program_that_is_paused_can_be_ended(tmp_path: Path) -> None:
+async def test_a_paused_program_can_be_ended(tmp_path: Path) -> None:
     text = f"echo $$ > {tmp_path}/pid; exec sleep 600"
     run = Scripts(program(tmp_path, text)).start(Script(run="beep"))
     pid = int(await written(tmp_path / "pid"))
@@ -222,7 +220,7 @@ async def test_a_program_that_is_paused_can_be_ended(tmp_path: Path) -> None:
     assert _gone(pid)
 
 
-async def test_a_program_of_another_user_that_cannot_be_paused_goes_on(
+async def test_a_program_that_may_not_be_paused_goes_on(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     def refuse(_group: int, _number: int) -> None:
@@ -238,16 +236,14 @@ async def test_a_program_of_another_user_that_cannot_be_paused_goes_on(
     assert await ended(run) == (True, "ended well")
 
 
-def test_a_program_whose_decision_died_before_it_began_does_not_begin() -> None:
+def test_a_program_does_not_start_if_decision_died_before() -> None:
     command = ("/bin/sh", "-c", LEASHED, "sh", "echo", "begun")
     ran = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, check=False)
     assert (ran.returncode, ran.stdout) == (1, b"")
 
 
 @pytest.mark.parametrize("paused", [False, True])
-async def test_a_program_does_not_outlive_a_decision_that_is_killed(
-    tmp_path: Path, paused: bool
-) -> None:
+async def test_a_program_ends_with_a_killed_decision(tmp_path: Path, paused: bool) -> None:
     folder = program(tmp_path, f"sleep 600 & echo $! > {tmp_path}/child; wait")
     text = (
         "import asyncio, os\n"
@@ -273,7 +269,7 @@ async def test_a_program_does_not_outlive_a_decision_that_is_killed(
 
 
 async def written(file: Path) -> str:
-    """Return what is written to a file, once there is something."""
+    """Wait until a file has content, and return it."""
 
     def text() -> str:
         return file.read_text() if file.exists() else ""
@@ -292,12 +288,12 @@ def _gone(pid: int) -> bool:
 
 
 @pytest.mark.parametrize("name", ["../beep", "/bin/sh", "boop"])
-def test_no_program_of_elsewhere_is_run(tmp_path: Path, name: str) -> None:
+def test_programs_outside_the_folder_are_refused(tmp_path: Path, name: str) -> None:
     with pytest.raises(ConfigError, match="no script"):
         Scripts(program(tmp_path, "exit 0")).path(name)
 
 
-def test_a_program_that_may_not_be_run_is_refused(tmp_path: Path) -> None:
+def test_a_program_without_execute_permission_is_refused(tmp_path: Path) -> None:
     folder = program(tmp_path, "exit 0")
     (tmp_path / "beep").chmod(0o644)
     with pytest.raises(Refused, match="script 'beep' is not executable; chmod \\+x "):

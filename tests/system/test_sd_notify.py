@@ -13,13 +13,13 @@ from gigabrain_zenoh.testing.waiting import until
 ALL_READY = "STATUS=all ready: router, driver, perception, decision, control, safety"
 
 
-def knows_of_the_manager(pid: int) -> bool:
+def has_manager_socket(pid: int) -> bool:
     """Return whether a process could notify the service manager."""
     return b"NOTIFY_SOCKET" in Path(f"/proc/{pid}/environ").read_bytes()
 
 
 @pytest.mark.slow
-async def test_up_tells_its_service_manager_how_all_are_doing(
+async def test_up_notifies_its_service_manager_of_the_state_of_all_processes(
     home: Home, service_manager: ServiceManager, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("NOTIFY_SOCKET", f"{tmp_path}/notify")
@@ -32,12 +32,12 @@ async def test_up_tells_its_service_manager_how_all_are_doing(
     await until(lambda: service_manager.received[-1] == "WATCHDOG=1", "the watchdog is fed")
     async with probing(endpoint_of(file)) as robot:
         pid = await robot.pid("decision")
-        assert not knows_of_the_manager(pid)
+        assert not has_manager_socket(pid)
         os.kill(pid, signal.SIGSTOP)
         await until(
             lambda: "STATUS=stuck: decision" in service_manager.received, "it is seen to be stuck"
         )
-        await robot.ticks(100)  # twice the watchdog's time
+        await robot.ticks(100)  # twice the watchdog's timeout
         assert service_manager.received[-1] == "STATUS=stuck: decision"
         os.kill(pid, signal.SIGCONT)
         await until(lambda: service_manager.received[-1] == "WATCHDOG=1", "it gets on again")
@@ -47,4 +47,4 @@ async def test_up_tells_its_service_manager_how_all_are_doing(
     up.send(signal.SIGTERM)
     assert await up.ended() == 0
     assert service_manager.received[-1] == "STOPPING=1"
-    assert up.out.count("progress") == 1  # that there was none; beats are not shown
+    assert up.out.count("progress") == 1  # "no progress" once; heartbeats are not shown

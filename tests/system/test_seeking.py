@@ -1,6 +1,6 @@
-"""A whole robot drives before things and tags that its camera would recognise.
+"""A whole robot drives to things and tags that its camera sees.
 
-The test plays the recognition process, with the truth of the simulator.
+The test stands in for the recognition process, with the truth of the simulator.
 """
 
 import contextlib
@@ -25,27 +25,27 @@ from gigabrain_zenoh.testing.processes import Home, robot_of
 from gigabrain_zenoh.testing.waiting import until
 from tests.system.test_cameras import can_draw
 
-COMPILING_S = 600.0  # at the very first start
+COMPILE_TIMEOUT_S = 600.0  # the first start compiles
 SIGHT_M, HALF_VIEW = 2.5, 0.45
 CORNERS = ((100.0, 100.0), (120.0, 100.0), (120.0, 80.0), (100.0, 80.0))
-TAG = Pose(x=0.9, y=3.15, yaw=-math.pi / 2)  # in the world, on its wall
+TAG = Pose(x=0.9, y=3.15, yaw=-math.pi / 2)  # on a wall of the world
 
 
 @dataclass
-class Recogniser:
-    """Publishes what the camera sees of some things, as the truth is."""
+class FakeRecognition:
+    """Publishes true detections of things in the camera's view."""
 
     bus: Bus
-    body: str  # of the robot, in the scene
+    body: str  # the robot's body in the scene
     cans: list[Thing] = field(default_factory=list)
     tags: dict[int, Pose] = field(default_factory=dict)
-    place: Pose = ORIGIN  # of the robot, in the world
+    place: Pose = ORIGIN  # the robot's true pose
     pictures: int = 0
     scene: SimScene | None = None
 
     def watch(self) -> None:
-        """Look from now on, five times a second."""
-        self.bus.latest(STATE)  # for the ticks of its messages
+        """Start to publish detections, five times a second."""
+        self.bus.latest(STATE)  # its messages need the robot's ticks
         self.bus.latest(SIM_SCENE, self._on_scene)
         self.bus.subscribe(SIM_POSES, lambda _key, poses: self._on_poses(poses))
 
@@ -83,19 +83,19 @@ class Recogniser:
             orientation=(0.0, 0.0, math.sin(seen.yaw / 2), math.cos(seen.yaw / 2)),
         )  # fmt: skip
 
-    def off(self, x: float, y: float) -> tuple[float, float]:
-        """Return the distance of the robot to a place [m], and its angle off the heading [rad]."""
+    def distance_and_bearing(self, x: float, y: float) -> tuple[float, float]:
+        """Return distance [m] and absolute bearing [rad] of a place from the robot."""
         ahead, left = to_frame(self.place, x, y)
         return math.hypot(ahead, left), abs(math.atan2(left, ahead))
 
     def sees(self, x: float, y: float) -> bool:
-        far, turn = self.off(x, y)
-        return far < SIGHT_M and turn < HALF_VIEW
+        distance, turn = self.distance_and_bearing(x, y)
+        return distance < SIGHT_M and turn < HALF_VIEW
 
 
 @contextlib.asynccontextmanager
-async def seeing(home: Home) -> AsyncIterator[Recogniser]:
-    """A robot with a camera in the arena, and somebody who recognises for it."""
+async def robot_with_recognition(home: Home) -> AsyncIterator[FakeRecognition]:
+    """Run a robot with a camera in the arena, and a fake recognition process."""
     file = home.deployment(
         body="turtlebot3_waffle", world="arena", speed=2.0, resume="auto", cameras=True,
         recognition=False, perception={"mapping": "slam"}, decision={"behaviour": "navigate"},
@@ -103,19 +103,17 @@ async def seeing(home: Home) -> AsyncIterator[Recogniser]:
     up = home.start("up", str(file))
     endpoint = await robot_of(home, up)
     async with connect(endpoint, "looker", timeout_s=None) as bus, probing(endpoint) as robot:
-        await until(lambda: robot.state.gate.mode == "enabled", "driving", COMPILING_S)
-        recogniser = Recogniser(bus, "robot/base")
-        recogniser.watch()
-        await until(lambda: recogniser.pictures > 5, "the truth")
-        yield recogniser
+        await until(lambda: robot.state.gate.mode == "enabled", "driving", COMPILE_TIMEOUT_S)
+        recognition = FakeRecognition(bus, "robot/base")
+        recognition.watch()
+        await until(lambda: recognition.pictures > 5, "the truth")
+        yield recognition
 
 
 @pytest.mark.slow
 @pytest.mark.skipif(not can_draw(), reason="there is no OpenGL here")
-async def test_it_goes_before_cans_and_tags_finds_them_and_lists_them(
-    home: Home, tmp_path: Path
-) -> None:
-    async with seeing(home) as seen:
+async def test_it_drives_to_cans_and_tags_and_lists_them(home: Home, tmp_path: Path) -> None:
+    async with robot_with_recognition(home) as seen:
         nothing = await home.run("objects")
         assert nothing.out.startswith("no things and no tags")
         can = Thing(name="can", kind="cylinder", x=-1.2, y=1.0, size=(0.1, 0.1, 0.3))
@@ -125,8 +123,8 @@ async def test_it_goes_before_cans_and_tags_finds_them_and_lists_them(
 
         there = home.start("goto", "--object", "can")
         assert await there.ended(300.0) == 0, there.err
-        far, turn = seen.off(can.x, can.y)
-        assert 0.3 < far < 0.8
+        distance, turn = seen.distance_and_bearing(can.x, can.y)
+        assert 0.3 < distance < 0.8
         assert turn < 0.3
         listed = await home.run("objects", "--json")
         found = json.loads(listed.out)
@@ -134,8 +132,8 @@ async def test_it_goes_before_cans_and_tags_finds_them_and_lists_them(
 
         before = home.start("goto", "--tag", "7")
         assert await before.ended(300.0) == 0, before.err
-        far, turn = seen.off(TAG.x, TAG.y)
-        assert far < 0.9
+        distance, turn = seen.distance_and_bearing(TAG.x, TAG.y)
+        assert distance < 0.9
         assert turn < 0.3
         lost = await home.run("pose", "50", "-50", "0")
         assert lost.err.startswith("gigabrain: ")

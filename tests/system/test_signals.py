@@ -9,7 +9,7 @@ from gigabrain_zenoh.cli.app import COMMANDS
 from tests.qa.signal_commands import CALLS
 from tests.qa.signal_sweep import PATIENCE_S, Stage, attempt
 
-FIRST_S = 1.5  # of a life: imports, start-up, and what it is for
+FIRST_S = 1.5  # of each command: imports, start-up, work
 
 
 @pytest.fixture(scope="module")
@@ -30,5 +30,5 @@ def test_a_signal_at_any_moment_ends_a_command(stage: Stage, command: str, name:
         at_s = random.Random(f"{command} {number} {name}").random() * FIRST_S
         trial = attempt(stage, command, number, name, at_s, {0})
         assert trial.took_s < PATIENCE_S
-        late = trial.problem.startswith("did not end in time")  # how long is for `make qa`
+        late = trial.problem.startswith("did not end in time")  # `make qa` judges the time
         assert late or not trial.problem, trial

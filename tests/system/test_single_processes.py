@@ -1,4 +1,4 @@
-"""Processes one by one: they wait for their router, can be ended, and none starts twice."""
+"""Processes started one by one: they wait for their router, can be ended, and run only once."""
 
 import signal
 
@@ -12,7 +12,7 @@ from gigabrain_zenoh.testing.processes import Home, free_port
 from gigabrain_zenoh.testing.waiting import until
 
 
-async def test_a_missing_router_is_waited_for_and_said_in_one_line(home: Home) -> None:
+async def test_a_process_waits_for_a_missing_router_with_one_line(home: Home) -> None:
     where = f"tcp/127.0.0.1:{free_port()}"
     perception = home.start("perception", "--connect", where)
     waiting = f"no router at {where} yet; waiting for it (start one with: gigabrain router)"
@@ -41,7 +41,7 @@ async def test_tools_find_a_robot_that_was_started_process_by_process(home: Home
     assert await router.ended() == 0
 
 
-async def test_a_process_that_waits_for_its_router_can_be_ended(home: Home) -> None:
+async def test_a_process_waiting_for_its_router_can_be_ended(home: Home) -> None:
     control = home.start("control", "--connect", f"tcp/127.0.0.1:{free_port()}")
     await until(lambda: "waiting for it" in control.err, "it waits")
     control.send(signal.SIGTERM)
@@ -64,7 +64,7 @@ async def test_a_second_driver_for_the_same_body_is_refused_in_one_line(home: Ho
 
 
 @pytest.mark.slow
-async def test_of_two_drivers_that_start_together_exactly_one_stays(home: Home) -> None:
+async def test_of_two_drivers_started_together_exactly_one_remains(home: Home) -> None:
     where = f"tcp/127.0.0.1:{free_port()}"
     home.start("router", "--listen", where)
     both = [home.start("driver", "run", "mock", "--connect", where) for _ in range(2)]
@@ -74,19 +74,19 @@ async def test_of_two_drivers_that_start_together_exactly_one_stays(home: Home) 
     assert await left.ended() == 2
     assert f"a driver is already running here (pid {stays.pid} on " in left.err
     async with probing(Endpoint(connect=(where,))) as robot:
-        await robot.ticks(250)  # until the one that stays has settled
+        await robot.ticks(250)  # until the remaining one has settled
         replies = await robot.bus.ask(DESCRIBE, DescribeRequest(), name="driver", timeout_s=20)
         assert [(one.pid, one.claim) for one in replies] == [(stays.pid, "settled")]
 
 
 @pytest.mark.slow
-async def test_a_process_that_was_replaced_while_it_was_stopped_leaves(home: Home) -> None:
+async def test_a_suspended_process_that_was_replaced_exits_when_resumed(home: Home) -> None:
     where = f"tcp/127.0.0.1:{free_port()}"
     router = home.start("router", "--listen", where)
     await until(lambda: "ready" in router.err, "the router")
     first = home.start("driver", "run", "mock", "--connect", where)
     async with probing(Endpoint(connect=(where,))) as robot:
-        await robot.ticks(250)  # until it has settled
+        await robot.ticks(250)  # until the driver has settled
         first.send(signal.SIGSTOP)  # Ctrl-Z
         second = home.start("driver", "run", "mock", "--connect", where)
         await until(lambda: "ready" in second.err, "the second driver")

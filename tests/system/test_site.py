@@ -1,4 +1,4 @@
-"""The built documentation site: it needs no server and no other host."""
+"""The built documentation site works from files, without any host."""
 
 import re
 from collections.abc import AsyncIterator
@@ -45,16 +45,16 @@ async def page() -> AsyncIterator[Page]:
 
 
 @needs_browser
-async def test_the_search_works_on_files_without_a_request_to_any_host(
+async def test_the_search_works_from_files_without_requests_to_a_host(
     site: Path, page: Page
 ) -> None:
     asked: list[str] = []
     page.on("request", lambda request: asked.append(request.url))
-    for _ in range(5):  # Enter opens the first result, also before all pages have been read
+    for _ in range(5):  # Enter opens the first result; not all pages may be indexed yet
         await page.goto((site / "index.html").as_uri())
         await page.get_by_role("button", name="Search").click()
         await page.keyboard.insert_text("safe_state")
-        for _ in range(300):  # the results are in a closed shadow root
+        for _ in range(300):  # results are in a closed shadow root
             await page.wait_for_timeout(100)
             await page.keyboard.press("Enter")
             if "/index.html" not in page.url:
@@ -66,7 +66,7 @@ async def test_the_search_works_on_files_without_a_request_to_any_host(
 
 
 @needs_browser
-async def test_the_api_page_has_what_the_docstrings_say(site: Path, page: Page) -> None:
+async def test_the_api_page_contains_the_docstrings(site: Path, page: Page) -> None:
     await page.goto((site / "reference/python.html").as_uri())
     text = await page.inner_text("article")
     assert "move(" in text

@@ -1,4 +1,4 @@
-"""Ctrl-C ends a process in good order, however often it is pressed."""
+"""Ctrl-C ends a process cleanly, however often it is pressed."""
 
 import subprocess
 import sys
@@ -24,17 +24,17 @@ print("in good order")
 
 
 def ended(*, stopped: bool) -> tuple[int, str]:
-    """The exit code and the output of a process that is interrupted after it has ended its work."""
+    """Return exit code and output of a process that is interrupted after its work."""
     words = (sys.executable, "-c", ENDS.format(stopped=stopped))
     done = subprocess.run(words, capture_output=True, text=True)
     return done.returncode, done.stdout
 
 
-def test_ctrl_c_after_a_stop_cuts_nothing_short() -> None:
+def test_ctrl_c_after_a_stop_does_not_interrupt_the_end() -> None:
     assert ended(stopped=True) == (0, "in good order\n")
 
 
-def test_ctrl_c_after_work_that_nobody_stopped_ends_the_process() -> None:
+def test_ctrl_c_after_completed_work_ends_the_process() -> None:
     code, out = ended(stopped=False)
     assert code != 0
     assert out == ""

@@ -22,7 +22,7 @@ pytestmark = [
 ]
 
 
-async def test_a_process_starts_when_those_before_it_are_ready_and_not_merely_started(
+async def test_a_process_starts_when_its_predecessors_are_ready(
     tmp_path: Path,
 ) -> None:
     go_on = tmp_path / "go_on"
@@ -49,7 +49,7 @@ say('ready'); wait()"""
         assert supervisor.deaths == 0
 
 
-async def test_a_process_that_dies_is_started_again() -> None:
+async def test_a_dead_process_is_restarted() -> None:
     async with running(spec("control")) as (supervisor, records):
         status = supervisor.statuses["control"]
         await until(lambda: status.state == "ready")
@@ -65,7 +65,7 @@ async def test_a_process_that_dies_is_started_again() -> None:
 
 
 @pytest.mark.slow
-async def test_a_process_that_freezes_for_ever_is_killed_and_started_again() -> None:
+async def test_a_frozen_process_is_killed_and_restarted() -> None:
     beating = """
 say('ready')
 while True:
@@ -81,7 +81,7 @@ while True:
         assert (control.last_exit, safety.restarts, supervisor.deaths) == (-9, 0, 1)
 
 
-async def test_a_restart_leaves_those_that_come_after_alone() -> None:
+async def test_a_restart_does_not_restart_later_processes() -> None:
     async with running(spec("driver"), spec("control", SERVE, "driver")) as (supervisor, _):
         driver, control = supervisor.statuses["driver"], supervisor.statuses["control"]
         await until(lambda: control.state == "ready")
@@ -91,7 +91,7 @@ async def test_a_restart_leaves_those_that_come_after_alone() -> None:
         assert (control.pid, control.restarts) == (pid, 0)
 
 
-async def test_five_deaths_are_enough_and_a_sentence_says_so() -> None:
+async def test_a_process_is_given_up_after_five_deaths_with_one_line() -> None:
     async with running(spec("control", "sys.exit(7)")) as (supervisor, records):
         status = supervisor.statuses["control"]
         await until(lambda: status.state == "given up")
@@ -109,12 +109,12 @@ async def test_five_deaths_are_enough_and_a_sentence_says_so() -> None:
 
 
 def used_s() -> float:
-    """CPU time of this process and of its ended children, of the user and of the system."""
+    """Return the user and system CPU time of this process and its ended children [s]."""
     return sum(os.times()[:4])
 
 
-async def test_a_crash_loop_at_start_costs_its_five_starts_and_no_more() -> None:
-    """With the real times, and a real process that gets as far as reading its configuration."""
+async def test_a_crash_loop_costs_no_more_cpu_than_five_starts() -> None:
+    """Use the real pauses, and a real process that fails when it reads its configuration."""
     crasher = ProcessSpec("control", (*COMMAND, "{"))
     before_s = used_s()
     once = functools.partial(subprocess.run, capture_output=True, check=False)
@@ -132,7 +132,7 @@ async def test_a_crash_loop_at_start_costs_its_five_starts_and_no_more() -> None
     assert used_s() - before_s <= 3 * 5 * one_s  # a loop without pauses would start hundreds
 
 
-async def test_a_bad_configuration_is_not_tried_twice() -> None:
+async def test_a_process_with_a_bad_configuration_is_not_restarted() -> None:
     async with running(spec("driver", "sys.exit(2)")) as (supervisor, records):
         await until(lambda: supervisor.given_up)
         assert (supervisor.misconfigured, supervisor.deaths) == (("driver",), 1)
@@ -149,10 +149,10 @@ async def test_a_bad_configuration_is_not_tried_twice() -> None:
 
 
 @pytest.mark.parametrize("ready_end", [1, 2])
-async def test_a_process_that_was_ready_before_is_not_misconfigured(
+async def test_a_process_that_was_ready_before_is_always_restarted(
     tmp_path: Path, ready_end: int
 ) -> None:
-    """It ends for another reason, such as a full disk, or another process of its name."""
+    """It may end for another reason, such as a full disk or a second process of its name."""
     once = f"os.path.exists({str(tmp_path / 'once')!r}) and sys.exit(2)"
     code = f"{once}; open({str(tmp_path / 'once')!r}, 'w'); say('ready'); sys.exit({ready_end})"
     async with running(spec("driver", code)) as (supervisor, records):
@@ -163,7 +163,7 @@ async def test_a_process_that_was_ready_before_is_not_misconfigured(
         ]
 
 
-async def test_a_program_that_is_not_there_is_not_tried_twice() -> None:
+async def test_a_missing_program_is_not_restarted() -> None:
     missing = ProcessSpec("driver", ("/nowhere/gigabrain",))
     async with running(missing) as (supervisor, records):
         await until(lambda: supervisor.given_up)
@@ -172,7 +172,7 @@ async def test_a_program_that_is_not_there_is_not_tried_twice() -> None:
         assert text.endswith("is given up: it cannot run here")
 
 
-async def test_a_start_that_fails_for_want_of_resources_is_tried_again(
+async def test_a_start_that_fails_for_lack_of_resources_is_repeated(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     start, refusals = Child.start, [OSError(errno.EAGAIN, "Resource temporarily unavailable")]
@@ -189,7 +189,7 @@ async def test_a_start_that_fails_for_want_of_resources_is_tried_again(
         assert text.startswith(f"driver could not be started ([Errno {errno.EAGAIN}] Resource ")
 
 
-async def test_what_comes_after_a_process_that_is_given_up_is_not_started() -> None:
+async def test_processes_after_a_given_up_one_are_not_started() -> None:
     async with running(
         spec("driver", "sys.exit(2)"), spec("control", SERVE, "driver"), spec("page")
     ) as (supervisor, records):
@@ -199,7 +199,7 @@ async def test_what_comes_after_a_process_that_is_given_up_is_not_started() -> N
         assert supervisor.statuses["control"].state == "waiting"
 
 
-async def test_a_process_that_does_not_get_ready_is_killed_and_counts_as_dead() -> None:
+async def test_a_process_that_does_not_become_ready_is_killed() -> None:
     async with running(spec("driver", "wait()", ready_timeout_s=0.2)) as (supervisor, records):
         status = supervisor.statuses["driver"]
         await until(lambda: status.restarts)
@@ -208,7 +208,7 @@ async def test_a_process_that_does_not_get_ready_is_killed_and_counts_as_dead() 
         assert records.texts("not ready")[0] == "driver was not ready within 0.2 s and is killed"
 
 
-async def test_what_a_process_writes_that_is_no_record_becomes_one() -> None:
+async def test_plain_output_of_a_process_becomes_log_records() -> None:
     code = """
 print('to stdout')
 print('x' * 300_000, file=sys.stderr, flush=True)
@@ -220,8 +220,8 @@ sys.exit(1)
 """
     async with running(spec("driver", code)) as (_, records):
         await until(lambda: records.texts("died"))
-        said = [record for _, record in records.all]
-        output = [r["text"] for r in said if r["event"] == "output"]
+        logged = [record for _, record in records.all]
+        output = [r["text"] for r in logged if r["event"] == "output"]
         assert [text for text in output if not text.startswith("x")][:5] == [
             "to stdout",
             "\ufffd\x00 panicked",
@@ -230,19 +230,19 @@ sys.exit(1)
             "no newline at the end",
         ]
         assert sum(len(text) for text in output if text.startswith("x")) == 300_000
-        assert next(len(r["text"]) for r in said if r["event"] == "long") == 200_000
-        ready = next(r for r in said if r["event"] == "ready")
+        assert next(len(r["text"]) for r in logged if r["event"] == "long") == 200_000
+        ready = next(r for r in logged if r["event"] == "ready")
         assert (ready["level"], ready["process"]) == ("warning", "driver")
 
 
-async def test_a_process_knows_its_supervisor_and_its_output_is_not_held_back() -> None:
+async def test_a_process_knows_its_supervisor_and_its_output_is_unbuffered() -> None:
     code = "print(os.environ['GIGABRAIN_SUPERVISOR']); " + SERVE
     async with running(spec("one", code)) as (_, records):
         await until(lambda: records.texts("output"))
         assert records.texts("output") == [str(os.getpid())]
 
 
-async def test_a_fault_of_the_supervisor_itself_is_not_swallowed() -> None:
+async def test_an_exception_in_the_supervisor_is_raised() -> None:
     def broken(name: str, record: Mapping[str, Any]) -> None:
         if record["event"] == "given up":
             raise RuntimeError("the console is gone")
@@ -253,7 +253,7 @@ async def test_a_fault_of_the_supervisor_itself_is_not_swallowed() -> None:
     assert supervisor.statuses["two"].state == "stopped"
 
 
-def test_names_that_make_no_sense_are_refused() -> None:
+def test_invalid_process_names_are_refused() -> None:
     with pytest.raises(UnknownName, match="no process 'drivr'; did you mean 'driver'"):
         Supervisor([spec("driver"), spec("control", SERVE, "drivr")], Records())
     with pytest.raises(ConfigError, match="2 processes are called 'driver'; expected one"):
@@ -276,12 +276,12 @@ async def whole_life() -> None:
         assert (driver.last_exit, control.last_exit) == (-15, -9)
 
 
-def test_it_works_on_uvloop_too() -> None:
+def test_the_supervisor_works_on_uvloop_too() -> None:
     uvloop = pytest.importorskip("uvloop")
     with asyncio.Runner(loop_factory=uvloop.new_event_loop) as runner:
         runner.run(whole_life())
 
 
-def test_it_works_on_asyncio_in_debug_mode() -> None:
+def test_the_supervisor_works_with_asyncio_in_debug_mode() -> None:
     with asyncio.Runner(debug=True) as runner:
         runner.run(whole_life())

@@ -29,8 +29,8 @@ pytestmark = [
 ]
 
 
-async def test_all_end_also_those_that_hang_or_are_frozen_and_the_router_last() -> None:
-    # waits for the signal in the open: a handler must not write while a write goes on
+async def test_all_processes_end_even_hanging_or_frozen_ones_and_the_router_last() -> None:
+    # uses sigwait, because a signal handler must not write during another write
     obedient = """
 signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGTERM})
 say('ready')
@@ -58,7 +58,7 @@ say('bye')
         assert supervisor.deaths == 0
 
 
-async def test_all_end_also_while_they_wait_start_or_back_off() -> None:
+async def test_all_processes_end_also_while_waiting_starting_or_backing_off() -> None:
     async with running(
         spec("starting", "wait()"),
         spec("waiting", SERVE, "starting"),
@@ -70,7 +70,7 @@ async def test_all_end_also_while_they_wait_start_or_back_off() -> None:
         assert {s.state for s in supervisor.statuses.values()} == {"stopped"}
 
 
-async def test_a_stop_at_any_moment_of_the_start_leaves_nothing_behind() -> None:
+async def test_a_stop_at_any_moment_of_the_start_leaves_no_process() -> None:
     for turns in range(0, 12, 2):
         supervisor = Supervisor([spec("one"), spec("two")], Records(), QUICK)
         task = asyncio.create_task(supervisor.run())
@@ -89,7 +89,7 @@ async def test_a_stop_before_the_start_starts_nothing() -> None:
     assert records.all == []
 
 
-async def test_a_cancelled_run_ends_all() -> None:
+async def test_a_cancelled_run_ends_all_processes() -> None:
     supervisor = Supervisor([spec("one"), spec("two", HANG)], Records(), QUICK)
     task = asyncio.create_task(supervisor.run())
     await until(lambda: all(s.state == "ready" for s in supervisor.statuses.values()))
@@ -100,15 +100,15 @@ async def test_a_cancelled_run_ends_all() -> None:
     assert not any(alive(pid) for pid in pids)
 
 
-async def test_a_run_that_is_cancelled_again_before_its_stop_has_begun_ends_all() -> None:
-    """As by a second Ctrl-C, when all that asyncio runs is cancelled."""
+async def test_a_run_cancelled_twice_ends_all_processes() -> None:
+    """A second Ctrl-C cancels all tasks of asyncio."""
     supervisor = Supervisor([spec("one"), spec("two", HANG)], Records(), QUICK)
     before = asyncio.all_tasks()
     task = asyncio.create_task(supervisor.run())
     await until(lambda: all(s.state == "ready" for s in supervisor.statuses.values()))
     pids = [status.pid or 0 for status in supervisor.statuses.values()]
     task.cancel()
-    await asyncio.sleep(0)  # the stop is wanted, and has not begun
+    await asyncio.sleep(0)  # the stop is requested but has not begun
     left = asyncio.all_tasks() - before
     for each in left:
         each.cancel()
@@ -124,8 +124,8 @@ time.sleep(60)
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="by ptrace(2)")
-async def test_a_process_that_the_kernel_does_not_let_go_holds_up_no_end() -> None:
-    """As one that waits for a broken device: a killed one that is traced is not reaped either."""
+async def test_an_unkillable_process_does_not_delay_the_end() -> None:
+    """A traced process stands for one blocked in a broken device: neither is reaped when killed."""
     supervisor = Supervisor([spec("one"), spec("two")], Records(), QUICK)
     task = asyncio.create_task(supervisor.run())
     await until(lambda: all(s.state == "ready" for s in supervisor.statuses.values()))
@@ -146,7 +146,7 @@ async def test_a_process_that_the_kernel_does_not_let_go_holds_up_no_end() -> No
     await reaped(int(held))
 
 
-async def test_a_terminals_ctrl_c_does_not_reach_the_processes() -> None:
+async def test_ctrl_c_of_the_terminal_does_not_reach_the_processes() -> None:
     async with running(spec("one")) as (supervisor, _):
         await until(lambda: supervisor.statuses["one"].state == "ready")
         pid = supervisor.statuses["one"].pid or 0
@@ -154,7 +154,7 @@ async def test_a_terminals_ctrl_c_does_not_reach_the_processes() -> None:
         assert os.getsid(pid) == pid
 
 
-async def test_what_a_dead_process_has_started_goes_with_it() -> None:
+async def test_children_of_a_dead_process_are_ended() -> None:
     code = "p = subprocess.Popen(['sleep', '60']); say('ready', child_pid=p.pid); sys.exit(1)"
     async with running(spec("driver", code)) as (supervisor, records):
         await until(lambda: supervisor.deaths)
@@ -162,14 +162,14 @@ async def test_what_a_dead_process_has_started_goes_with_it() -> None:
         await until(lambda: not alive(pid))
 
 
-TIED = CHILD + "lifeline.die_with_supervisor(); "
+DIES_WITH_SUPERVISOR = CHILD + "lifeline.die_with_supervisor(); "
 
 
-async def test_nothing_is_left_when_the_supervisor_is_killed() -> None:
+async def test_no_process_is_left_when_the_supervisor_is_killed() -> None:
     with another_supervisor(
-        obedient=TIED + SERVE,
-        hanging=TIED + HANG,
-        frozen=TIED + SERVE,
+        obedient=DIES_WITH_SUPERVISOR + SERVE,
+        hanging=DIES_WITH_SUPERVISOR + HANG,
+        frozen=DIES_WITH_SUPERVISOR + SERVE,
         watched=CHILD + "lifeline.watch_parent(os.getppid()); " + HANG,
     ) as (parent, pids):
         if sys.platform == "linux":
@@ -178,7 +178,7 @@ async def test_nothing_is_left_when_the_supervisor_is_killed() -> None:
         await until(lambda: not any(alive(pid) for pid in pids.values()))
 
 
-async def test_an_impatient_second_ctrl_c_leaves_nothing_behind() -> None:
+async def test_a_second_ctrl_c_leaves_no_process() -> None:
     with another_supervisor(hanging=CHILD + HANG, other=CHILD + HANG) as (parent, pids):
         parent.send_signal(signal.SIGINT)
         await asyncio.sleep(0.1)

@@ -1,4 +1,4 @@
-"""The files for service managers and containers, as far as they can be checked without either."""
+"""The files for service managers and containers, checked without running either."""
 
 import re
 import shutil
@@ -27,7 +27,7 @@ DOCKER = ROOT / "deploy" / "docker"
 
 @pytest.fixture(scope="module")
 def unit(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The unit of the host `robot`, with a program that is there."""
+    """Return the unit of the host `robot`, with an existing program."""
     if not shutil.which("systemd-analyze"):
         pytest.skip("no systemd-analyze here")
     path = tmp_path_factory.mktemp("units") / "gigabrain@robot.service"
@@ -51,18 +51,18 @@ def test_the_unit_is_exposed_to_2_of_10_at_most(unit: Path) -> None:
     assert judged.returncode == 0, judged.stdout
 
 
-def test_the_docs_say_what_a_unit_with_can_and_cameras_needs(unit: Path) -> None:
+def test_the_docs_list_the_rights_of_a_unit_with_can_and_cameras(unit: Path) -> None:
     docs = (ROOT / "docs" / "how-to" / "many_hosts.md").read_text()
     (more,) = re.findall(r"^```text\n(\[Service\]\n.*?)^```", docs, re.MULTILINE | re.DOTALL)
     own = unit.with_name("gigabrain@arm.service")
-    own.write_text(f"{unit.read_text()}\n{more}")  # later lines of a list are added
+    own.write_text(f"{unit.read_text()}\n{more}")  # later lines of a list add to it
     verified = analyze("verify", "--man=no", str(own))
     assert (verified.returncode, verified.stderr) == (0, "")
     judged = analyze("security", "--offline=true", "--threshold=25", "--no-pager", str(own))
     if "unrecognized option" in judged.stderr:
         pytest.skip("this systemd-analyze cannot judge a unit that does not run")
     assert judged.returncode == 0, judged.stdout
-    assert "AF_CAN" not in UNIT.read_text()  # only where it is needed
+    assert "AF_CAN" not in UNIT.read_text()  # not allowed by default
     assert {"AF_CAN", "char-video4linux"} <= {*re.split(r"[\s=]", more)}
 
 
@@ -74,7 +74,7 @@ exec setpriv --no-new-privs --bounding-set=-all --inh-caps=-all -- "$@"
 
 @pytest.fixture
 def bare(tmp_path: Path) -> Iterator[Home]:
-    """A home on a system that is read-only but for it, for processes that may do nothing else."""
+    """Return a home on an otherwise read-only system, for processes without capabilities."""
     inside = ("unshare", "--mount", "--", "sh", "-c", BARE.format(folder=tmp_path), "sh")
     if not all(map(shutil.which, ("unshare", "setpriv", "mount"))):
         pytest.skip("no unshare, setpriv and mount here")
@@ -88,7 +88,7 @@ def bare(tmp_path: Path) -> Iterator[Home]:
 
 
 @pytest.mark.slow
-async def test_it_runs_without_capabilities_on_a_read_only_system(bare: Home) -> None:
+async def test_a_robot_runs_without_capabilities_on_a_read_only_system(bare: Home) -> None:
     file = bare.deployment(resume="auto")
     up = bare.start("up", str(file))
     async with probing(endpoint_of(file)) as robot:
@@ -113,7 +113,7 @@ def test_the_compose_file_keeps_to_its_schema() -> None:
         check.validate(document)
 
 
-def test_keys_can_be_mounted_as_the_compose_file_says() -> None:
+def test_keys_mounted_as_in_the_compose_file_are_found() -> None:
     schema = yaml.safe_load((ROOT / "tests" / "data" / "compose_spec.json").read_text())
     text = (DOCKER / "compose.yaml").read_text().replace("# - ${KEYS}", "- ${KEYS}")
     document = yaml.safe_load(text)
@@ -134,7 +134,7 @@ def test_the_image_has_the_extras_that_its_default_command_needs() -> None:
         "nav": demo.perception.mapping == "slam" or demo.decision.behaviour == "navigate",
         "page": "page" in str(demo.hosts),
         "record": "recorder" in str(demo.hosts) or "foxglove" in str(demo.hosts),
-        "keys": True,  # compose.yaml says how they are mounted
+        "keys": True,  # mounted as compose.yaml says
     }
     assert {name for name, wanted in needs.items() if wanted} <= extras()
     known = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
@@ -159,12 +159,12 @@ def test_the_docs_install_a_deployment_with_keys_as_a_service() -> None:
     docs = (ROOT / "docs" / "how-to" / "many_hosts.md").read_text()
     (installed,) = re.findall(r"install .*(deploy/\S+) /etc/gigabrain/deployment\.yaml", docs)
     deployment = load_deployment(ROOT / installed)
-    assert Path(deployment.keys).name == "keys"  # beside the file, where the docs put them
+    assert Path(deployment.keys).name == "keys"  # beside the file, as in the docs
     assert re.search(r"cp .*home/robot/.* /etc/gigabrain/keys", docs)
     assert "/etc/gigabrain/deployment.yaml" in UNIT.read_text()
 
 
-def test_every_container_is_locked_up() -> None:
+def test_every_container_is_confined() -> None:
     services = loaded("compose.yaml")["services"]
     assert sorted(services) == ["brain", "robot"] == sorted(load_hosts())
     for name, service in services.items():
@@ -180,7 +180,7 @@ def load_hosts() -> list[str]:
     return list(load_deployment(DOCKER / "insecure.yaml").hosts)
 
 
-def test_the_image_has_no_root_and_no_build_tools_and_copies_what_there_is() -> None:
+def test_the_image_runs_without_root_and_build_tools_and_copies_existing_files() -> None:
     text = (DOCKER / "Dockerfile").read_text()
     build, final = re.split(r"^FROM .*\n", text, flags=re.MULTILINE)[1:]
     assert re.findall(r"^USER (.*)$", final, re.MULTILINE) == ["10001:10001"]

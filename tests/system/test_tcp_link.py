@@ -1,4 +1,4 @@
-"""TCP links: there and back, and peers that are gone, silent or take nothing."""
+"""TCP links: data both ways, and peers that are gone, silent, or do not read."""
 
 import asyncio
 import socket
@@ -8,7 +8,7 @@ import pytest
 from gigabrain_drivers.links.tcp_link import TcpLink
 from gigabrain_zenoh.clock import Clock
 from gigabrain_zenoh.testing.waiting import PATIENCE_S, until
-from tests.system.links import Heard
+from tests.system.links import LinkRecorder
 
 
 def server() -> socket.socket:
@@ -17,10 +17,10 @@ def server() -> socket.socket:
     return listening
 
 
-async def test_tcp_there_and_back_and_again_after_the_peer_is_gone() -> None:
+async def test_a_tcp_link_transfers_both_ways_and_reconnects_to_its_peer() -> None:
     with server() as listening:
         link = TcpLink("127.0.0.1", listening.getsockname()[1], Clock(), quiet_ns=None)
-        received = Heard(link)
+        received = LinkRecorder(link)
         link.open()
         peer, _ = await asyncio.to_thread(listening.accept)
         await until(lambda: link.connected)
@@ -35,10 +35,10 @@ async def test_tcp_there_and_back_and_again_after_the_peer_is_gone() -> None:
         peer.close()
 
 
-async def test_a_tcp_peer_that_falls_silent_is_dropped_and_gets_nothing_old() -> None:
+async def test_a_silent_tcp_peer_is_dropped_and_gets_no_old_bytes() -> None:
     with server() as listening:
         link = TcpLink("127.0.0.1", listening.getsockname()[1], Clock(), quiet_ns=100_000_000)
-        received = Heard(link)
+        received = LinkRecorder(link)
         link.open()
         frozen, _ = await asyncio.to_thread(listening.accept)
         await until(lambda: link.connected)
@@ -56,10 +56,10 @@ async def test_a_tcp_peer_that_falls_silent_is_dropped_and_gets_nothing_old() ->
         peer.close()
 
 
-async def test_a_tcp_peer_that_takes_nothing_is_dropped_in_the_middle_of_a_frame() -> None:
+async def test_a_tcp_peer_that_does_not_read_is_dropped_in_mid_frame() -> None:
     with server() as listening:
         link = TcpLink("127.0.0.1", listening.getsockname()[1], Clock(), quiet_ns=None)
-        received = Heard(link)
+        received = LinkRecorder(link)
         link.open()
         peer, _ = await asyncio.to_thread(listening.accept)
         await until(lambda: link.connected)
@@ -73,7 +73,7 @@ async def test_a_tcp_peer_that_takes_nothing_is_dropped_in_the_middle_of_a_frame
 @pytest.mark.parametrize(
     ("host", "complaint"), [("127.0.0.1", "nothing listens"), ("no.such.host.invalid", "no host")]
 )
-async def test_a_tcp_port_that_cannot_be_reached_says_so(host: str, complaint: str) -> None:
+async def test_an_unreachable_tcp_port_is_reported(host: str, complaint: str) -> None:
     with server() as listening:
         port = listening.getsockname()[1]
     link = TcpLink(host, port, Clock())
@@ -82,7 +82,7 @@ async def test_a_tcp_port_that_cannot_be_reached_says_so(host: str, complaint: s
     await link.close()
 
 
-async def test_a_name_is_tried_at_all_its_addresses(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_all_addresses_of_a_host_name_are_tried(monkeypatch: pytest.MonkeyPatch) -> None:
     with server() as listening:
         port = listening.getsockname()[1]
         loop = asyncio.get_running_loop()

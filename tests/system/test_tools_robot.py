@@ -1,4 +1,4 @@
-"""The tools beside a robot that runs: one demo, broken link by link with real signals."""
+"""The command-line tools beside one running demo, whose processes get real signals."""
 
 import asyncio
 import contextlib
@@ -23,7 +23,7 @@ from gigabrain_zenoh.testing.waiting import until
 
 @pytest.fixture
 async def demo(shared_home: Home) -> Home:
-    """A robot that drives: the mock, the same one for all tests."""
+    """The driving mock robot, shared by all tests of this file."""
     if not shared_home.processes():
         arguments = (
             *AVOID,
@@ -40,7 +40,7 @@ async def demo(shared_home: Home) -> Home:
 
 @contextlib.asynccontextmanager
 async def looking(home: Home) -> AsyncIterator[Probe]:
-    """Somebody at the robot of this home."""
+    """Yield a probe of the robot of this home."""
     (note,) = (home.folder / "run" / "gigabrain").glob("*.json")
     endpoint = msgspec.json.decode(note.read_bytes(), type=Running).endpoint
     async with probing(endpoint) as seen:
@@ -48,7 +48,7 @@ async def looking(home: Home) -> AsyncIterator[Probe]:
 
 
 async def until_driving(home: Home) -> None:
-    """Whatever was broken is whole again, and the brain drives."""
+    """Repair the robot and wait until the brain drives."""
     async with looking(home) as seen:
         while (seen.state.gate.mode, seen.state.gate.commander) != ("enabled", BRAIN):
             if seen.state.gate.mode == "idle":
@@ -57,19 +57,19 @@ async def until_driving(home: Home) -> None:
 
 
 async def printed(home: Home, *arguments: str) -> str:
-    """Run a command that has to succeed, and return its output."""
+    """Run a command that must succeed, and return its output."""
     command = await home.run(*arguments)
     assert await command.ended() == 0, command.err
     return command.out
 
 
-async def test_topics_are_listed_shown_and_measured(demo: Home) -> None:
+async def test_topic_commands_list_show_and_measure_topics(demo: Home) -> None:
     commands = (
         "list", "echo scan -n 1", "echo state --json -n 3", "hz scan -n 1", "bw scan -n 1",
         "delay scan -n 1", "info scan",
     )  # fmt: skip
-    told = [printed(demo, "topic", *command.split()) for command in commands]
-    table, scan, states, hz, size, delay, about = await asyncio.gather(*told)
+    outputs = [printed(demo, "topic", *command.split()) for command in commands]
+    table, scan, states, hz, size, delay, about = await asyncio.gather(*outputs)
     assert re.search(r"^scan +LaserScan +\d+\.\d +10 +\d{4} .* driver +perception", table, re.M)
     assert re.search(r"^ranges: 360 values, min ", scan, re.M)
     assert [json.loads(line)["key"] for line in states.splitlines()] == ["robot/state"] * 3
@@ -79,7 +79,7 @@ async def test_topics_are_listed_shown_and_measured(demo: Home) -> None:
     assert "from driver to perception" in about
 
 
-async def test_foreign_keys_are_shown_raw_and_unknown_ones_answered_with_the_nearest(
+async def test_foreign_keys_are_shown_raw_and_unknown_ones_get_a_suggestion(
     demo: Home,
 ) -> None:
     wrong = await demo.run("topic", "echo", "scna")
@@ -90,7 +90,7 @@ async def test_foreign_keys_are_shown_raw_and_unknown_ones_answered_with_the_nea
     assert "robot/pose (senders: none" in silent.err
 
 
-async def test_a_message_that_is_sent_arrives(demo: Home) -> None:
+async def test_a_message_published_by_command_arrives(demo: Home) -> None:
     ear = demo.start("topic", "echo", "teleop", "-n", "1", "--fields", "linear_x")
     for _ in range(20):
         if not ear.running:
@@ -101,12 +101,12 @@ async def test_a_message_that_is_sent_arrives(demo: Home) -> None:
     assert await (await demo.run("enable", "--take")).ended() == 0
 
 
-async def test_a_velocity_asks_for_the_body_and_gives_it_back(demo: Home) -> None:
+async def test_a_velocity_command_takes_the_body_and_returns_it(demo: Home) -> None:
     refused = await demo.run("topic", "pub", "cmd_vel", "linear_x=0.1")
     assert await refused.ended() == 1
     assert "control drives" in refused.err
     assert "--take" in refused.err
-    for _ in range(5):  # a process that is starved for 150 ms closes the gate meanwhile
+    for _ in range(5):  # repeat: a process starved for 150 ms closes the gate
         driven = await demo.run("topic", "pub", "cmd_vel", "linear_x=0.1", "--take")
         if re.fullmatch(r"driven for \d\.\d s; control drives\n", driven.out):
             break
@@ -122,9 +122,9 @@ async def test_a_velocity_asks_for_the_body_and_gives_it_back(demo: Home) -> Non
 
 
 async def test_processes_and_their_graph_are_shown(demo: Home) -> None:
-    told = ("node list", "node info driver", "graph", "top --once")
+    commands = ("node list", "node info driver", "graph", "top --once")
     table, driver, graph, once = await asyncio.gather(
-        *(printed(demo, *command.split()) for command in told)
+        *(printed(demo, *command.split()) for command in commands)
     )
     assert {line.split()[0] for line in table.splitlines()} >= set(ORDER)
     assert "stale_commands_executed" in driver
@@ -136,8 +136,8 @@ async def test_processes_and_their_graph_are_shown(demo: Home) -> None:
 async def test_the_log_names_the_user_who_changed_a_parameter(demo: Home) -> None:
     follow = demo.start("log", "--follow", "--process", "decision", "--json", "-n", "1")
     await until(lambda: follow.out, "the log's past")
-    told = await printed(demo, "param", "set", "decision", "max_linear_speed", "0.15")
-    assert told == "decision: max_linear_speed is 0.15 now, it was 0.2\n"
+    output = await printed(demo, "param", "set", "decision", "max_linear_speed", "0.15")
+    assert output == "decision: max_linear_speed is 0.15 now, it was 0.2\n"
     assert await printed(demo, "param", "get", "decision", "max_linear_speed") == "0.15\n"
     refused = await demo.run("param", "set", "decision", "max_linear_speed", "fast")
     assert await refused.ended() == 1
@@ -167,12 +167,12 @@ async def test_a_process_that_hangs_is_named(
         why = await demo.run("why")
         assert (await why.ended(), words in why.out) == (code, True), why.out
     finally:
-        with contextlib.suppress(ProcessLookupError):  # killed and started again, if this took 5 s
+        with contextlib.suppress(ProcessLookupError):  # it may already be restarted, after 5 s
             os.kill(pid, signal.SIGCONT)
 
 
 def pid_of(home: Home, process: str) -> int:
-    """Of a supervised process."""
+    """Return the pid of a supervised process."""
     for pid in home.processes():
         with open(f"/proc/{pid}/cmdline") as file:
             if f'"name":"{process}"' in file.read():
@@ -181,8 +181,8 @@ def pid_of(home: Home, process: str) -> int:
 
 
 @pytest.mark.slow
-async def test_an_e_stop_is_named_with_the_way_out(demo: Home) -> None:
-    for _ in range(20):  # as busy as the machine may be
+async def test_an_e_stop_is_shown_with_its_remedy(demo: Home) -> None:
+    for _ in range(20):  # repeat on a busy machine
         moves = await demo.run("why")
         if await moves.ended() == 0:
             break
@@ -191,8 +191,8 @@ async def test_an_e_stop_is_named_with_the_way_out(demo: Home) -> None:
     assert await (await demo.run("estop")).ended() == 0
     latched = await demo.run("why", "--json")
     assert await latched.ended() == 18
-    told = json.loads(latched.out)
-    assert "latched" in {one["link"]: one["text"] for one in told["findings"]}["gate"]
+    explained = json.loads(latched.out)
+    assert "latched" in {one["link"]: one["text"] for one in explained["findings"]}["gate"]
     async with looking(demo) as seen:
         await seen.at_rest(30)
     assert await (await demo.run("release")).ended() == 0
@@ -201,7 +201,7 @@ async def test_an_e_stop_is_named_with_the_way_out(demo: Home) -> None:
     assert "idle: not enabled yet" in idle.out
 
 
-async def test_the_doctor_finds_a_process_that_is_gone(demo: Home) -> None:
+async def test_the_doctor_finds_a_missing_process(demo: Home) -> None:
     pid = pid_of(demo, "safety")
     os.kill(pid, signal.SIGSTOP)
     doctor = await demo.run("doctor")
@@ -212,7 +212,7 @@ async def test_the_doctor_finds_a_process_that_is_gone(demo: Home) -> None:
     assert "-> start it, or read its log: gigabrain log --process safety" in doctor.out
 
 
-async def test_pipes_end_without_a_complaint(demo: Home) -> None:
+async def test_a_closed_pipe_ends_a_command_without_an_error(demo: Home) -> None:
     async def broken_off(*arguments: str) -> str:
         read, write = os.pipe()
         command = demo.start(*arguments, stdout=write)
@@ -222,12 +222,12 @@ async def test_pipes_end_without_a_complaint(demo: Home) -> None:
         await command.ended()
         return command.err
 
-    # the router has said all: no line to come tells that nobody reads on
+    # the router logs no more, so no failing write reports the closed pipe
     commands = ("topic echo state", "log -n 1 --follow --process router", "topic list")
     assert await asyncio.gather(*(broken_off(*one.split()) for one in commands)) == ["", "", ""]
 
 
-async def test_without_a_robot_one_line_gives_the_remedy(home: Home) -> None:
+async def test_without_a_robot_one_line_names_the_remedy(home: Home) -> None:
     commands = (
         "topic list", "topic echo scan", "node list", "graph", "top --once", "param list",
         "foxglove", "log --follow --connect tcp/127.0.0.1:1",
@@ -238,7 +238,7 @@ async def test_without_a_robot_one_line_gives_the_remedy(home: Home) -> None:
         assert "gigabrain demo" in alone.err or "is the robot running" in alone.err
 
 
-async def test_why_and_doctor_say_that_no_robot_runs(home: Home) -> None:
+async def test_why_and_doctor_report_that_no_robot_runs(home: Home) -> None:
     why = await home.run("why")
     assert (await why.ended(), "no robot runs here" in why.out) == (10, True)
     doctor = await home.run("doctor", "--connect", f"tcp/127.0.0.1:{free_port()}")
@@ -246,7 +246,7 @@ async def test_why_and_doctor_say_that_no_robot_runs(home: Home) -> None:
 
 
 @pytest.mark.slow
-async def test_a_body_that_obeys_a_key_of_its_own_is_driven_and_explained_all_the_same(
+async def test_a_body_with_its_own_control_topic_is_driven_and_explained(
     home: Home,
 ) -> None:
     known = yaml.safe_load(robot_path("mock").read_text())

@@ -1,4 +1,4 @@
-"""The two TurtleBot3 as their files describe them: real ports, and both emulated as a whole."""
+"""Both TurtleBot3 as their files describe them: real ports, and whole emulated robots."""
 
 import asyncio
 import math
@@ -20,13 +20,13 @@ ROBOTS = ["turtlebot3_burger", "turtlebot3_waffle"]
 
 
 @pytest.mark.parametrize("robot", ROBOTS)
-def test_the_real_link_is_the_board_on_usb_and_a_lidar_beside_it(robot: str) -> None:
+def test_the_real_link_has_the_board_and_the_lidar_on_usb(robot: str) -> None:
     _, driver = make_driver(robot, Run(folder=Path(), link="real"))
     assert driver.options.port == "usb:0483:5740"
     assert driver.options.scan.port == "usb:10c4:ea60"
 
 
-def test_a_link_may_have_another_lidar_than_the_simulation() -> None:
+def test_a_real_link_may_have_another_lidar_than_the_simulation() -> None:
     real, _ = make_driver("turtlebot3_waffle", Run(folder=Path(), link="real"))
     simulated, _ = make_driver("turtlebot3_waffle", Run(folder=Path()))
     assert real.lidar
@@ -58,11 +58,11 @@ async def test_the_emulated_robot_drives_and_sees(robot: str, tmp_path: Path) ->
             assert await driver.get_sensor_data("scan") is scans[-1]
             assert description.lidar
             assert len(scans[-1].ranges_m) == description.lidar.beams
-        await until(lambda: emulator.body.commanded == (0.0, 0.0, 0.0))  # the last zero arrives
+        await until(lambda: emulator.body.commanded == (0.0, 0.0, 0.0))  # wait for the last zero
 
 
 @pytest.mark.parametrize(("rate", "refused"), [("10", True), ("5", False)])
-def test_an_lds01_is_only_believed_at_its_own_five_turns_a_second(
+def test_an_lds01_is_refused_at_other_than_five_turns_a_second(
     rate: str, refused: bool, tmp_path: Path
 ) -> None:
     mine = tmp_path / "robot.yaml"
@@ -82,7 +82,7 @@ def test_an_lds01_is_only_believed_at_its_own_five_turns_a_second(
         assert make_driver(str(mine), run)[1].options.scan.driver == "lds01"
 
 
-def test_the_burger_is_limited_to_what_its_motors_make_of_61_rpm() -> None:
+def test_the_speed_limit_of_the_burger_is_61_rpm_of_its_motors() -> None:
     robot, _ = make_driver("turtlebot3_burger", Run(folder=Path()))
     assert robot.max_linear_speed == pytest.approx(61 / 60 * math.tau * 0.033, rel=0.005)
     assert robot.max_angular_speed == pytest.approx(61 / 60 * math.tau * 0.033 / 0.08, rel=0.005)

@@ -1,4 +1,4 @@
-"""`gigabrain up`: starting, restarting, giving up, leaving nothing."""
+"""`gigabrain up` starts, restarts, gives up and ends processes, and leaves none behind."""
 
 import asyncio
 import contextlib
@@ -31,11 +31,11 @@ READY = re.compile(r"^\S+ (\w+) +info +ready pid=\d+$", re.MULTILINE)
 
 
 def ready(command: CommandProcess) -> list[str]:
-    """The processes that have said so, in the order in which they did."""
+    """Return the processes in the order in which they became ready."""
     return READY.findall(command.out)
 
 
-async def test_it_starts_in_readiness_order_restarts_what_dies_and_ends_cleanly(
+async def test_up_starts_in_order_of_readiness_restarts_dead_processes_and_ends_cleanly(
     home: Home,
 ) -> None:
     file = home.deployment()
@@ -64,7 +64,7 @@ async def test_after_five_deaths_within_a_minute_a_process_is_given_up_in_one_li
     async with probing(await robot_of(home, up)) as robot:
         killed = {await robot.pid("decision")}
         os.kill(*killed, signal.SIGKILL)
-        while len(killed) < 5:  # each at once: on a busy machine five starts may take a minute
+        while len(killed) < 5:  # kill each at once: on a busy machine five starts may take a minute
             for pid in set(home.processes("decision")) - killed:
                 killed.add(pid)
                 os.kill(pid, signal.SIGKILL)
@@ -72,13 +72,13 @@ async def test_after_five_deaths_within_a_minute_a_process_is_given_up_in_one_li
         given_up = "decision ended with signal 9 (Killed) and is given up: 5 deaths within 60 s"
         await until(lambda: given_up in up.out, "it is given up")
         assert len([line for line in up.out.splitlines() if given_up in line]) == 1
-        await robot.ticks(25)  # the others go on, and the body stands
+        await robot.ticks(25)  # the others go on; the body stands
         assert robot.state.gate.mode == "latched"
     up.send(signal.SIGINT)
     assert await up.ended() == 0
 
 
-async def test_it_goes_on_when_nobody_reads_what_it_says(home: Home) -> None:
+async def test_up_goes_on_if_its_output_is_not_read(home: Home) -> None:
     reader, writer = os.pipe()
     os.close(reader)
     up = home.start("up", str(home.deployment()), stdout=writer)
@@ -91,14 +91,14 @@ async def test_it_goes_on_when_nobody_reads_what_it_says(home: Home) -> None:
     assert up.err == ""
 
 
-async def test_a_terminal_that_stands_still_holds_up_neither_restarts_nor_the_end(
+async def test_a_blocked_terminal_delays_neither_restarts_nor_the_end(
     home: Home,
 ) -> None:
     reader, writer = os.pipe()
     os.set_blocking(writer, False)
     with contextlib.suppress(BlockingIOError):
         while True:
-            os.write(writer, bytes(4096))  # until it is full
+            os.write(writer, bytes(4096))  # until the pipe is full
     os.set_blocking(writer, True)
     up = home.start("up", str(home.deployment()), stdout=writer)
     os.close(writer)
@@ -117,23 +117,23 @@ async def test_a_terminal_that_stands_still_holds_up_neither_restarts_nor_the_en
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
-async def test_it_ends_cleanly_when_asked_or_when_its_terminal_has_gone(
+async def test_up_ends_cleanly_by_signal_or_when_its_terminal_is_closed(
     home: Home, number: signal.Signals
 ) -> None:
     terminal, side = os.openpty()
-    inherited = signal.signal(signal.SIGHUP, signal.SIG_DFL)  # ignored, where nohup runs the tests
+    inherited = signal.signal(signal.SIGHUP, signal.SIG_DFL)  # nohup may have ignored it
     up = home.start("up", str(home.deployment()), stdout=side)
     signal.signal(signal.SIGHUP, inherited)
     os.close(side)
     async with probing(await robot_of(home, up)) as robot:
         await robot.pids()
-    os.close(terminal)  # what it says from now on meets an error
+    os.close(terminal)  # later writes of the command fail
     up.send(number)
     assert await up.ended() == 0
     assert (up.err, home.processes()) == ("", [])
 
 
-async def test_impatience_does_not_disturb_its_end(home: Home) -> None:
+async def test_repeated_ctrl_c_does_not_disturb_the_end(home: Home) -> None:
     up = home.start("up", str(home.deployment()))
     await until(lambda: len(ready(up)) == 6, "six processes are ready")
     for _ in range(5):
@@ -145,7 +145,7 @@ async def test_impatience_does_not_disturb_its_end(home: Home) -> None:
 
 @pytest.fixture
 def small_disk(tmp_path: Path) -> Iterator[Home]:
-    """A home with 128 kB of disk, which goes with the last process that sees it."""
+    """Return a home with 128 kB of disk, which ends with the last process that sees it."""
     script = f'mount -t tmpfs -o size=128k none {tmp_path}/home/state && exec "$@"'
     inside = ("unshare", "--mount", "--", "sh", "-c", script, "sh")
     (tmp_path / "home" / "state").mkdir(parents=True)
@@ -157,7 +157,7 @@ def small_disk(tmp_path: Path) -> Iterator[Home]:
 
 
 @pytest.mark.slow
-async def test_a_full_disk_is_reported_once_and_stops_nobody(small_disk: Home) -> None:
+async def test_a_full_disk_is_reported_once_and_stops_no_process(small_disk: Home) -> None:
     file = small_disk.deployment(resume="auto")
     up = small_disk.start("up", str(file), "--level", "debug")
     async with probing(endpoint_of(file)) as robot:
@@ -174,7 +174,7 @@ async def test_a_full_disk_is_reported_once_and_stops_nobody(small_disk: Home) -
     assert up.err == ""
 
 
-async def test_nothing_survives_its_death_not_even_what_is_frozen(home: Home) -> None:
+async def test_no_process_survives_the_death_of_up_not_even_a_frozen_one(home: Home) -> None:
     file = home.deployment()
     up = home.start("up", str(file))
     async with probing(endpoint_of(file)) as robot:
@@ -184,12 +184,12 @@ async def test_nothing_survives_its_death_not_even_what_is_frozen(home: Home) ->
         await until(lambda: not home.processes(), "no orphan is left")
 
 
-async def test_the_hosts_of_a_deployment_make_one_robot(home: Home) -> None:
+async def test_the_hosts_of_a_deployment_form_one_robot(home: Home) -> None:
     ours = (ROOT / "deploy" / "three_hosts.yaml").read_text()
     where = f"tcp/127.0.0.1:{free_port()}"
     file = home.folder / "three_hosts.yaml"
     here = re.sub(r"router: tcp/\S+", f"router: {where}", ours)
-    file.write_text(re.sub(r"keys: .*", "", here))  # it is on loopback
+    file.write_text(re.sub(r"keys: .*", "", here))  # loopback needs no keys
     brain = home.start("up", str(file), "--host", "brain")
     body = home.start("up", str(file), "--host", "robot")
     async with probing(Endpoint(connect=(where,))) as robot:
@@ -199,13 +199,13 @@ async def test_the_hosts_of_a_deployment_make_one_robot(home: Home) -> None:
         await robot.ticks(30)
         await person.release()
         await robot.driving_straight(speed=0.15, room=0.0, by_hand=True)
-        os.kill(brain.pid, signal.SIGKILL)  # the whole host
+        os.kill(brain.pid, signal.SIGKILL)  # stands for the loss of the host
         await robot.at_rest()
         assert robot.state.gate.mode in ("stopping", "idle")
 
 
 @pytest.mark.parametrize("name", ["demo", "deploy/demo.yaml", "three_hosts"])
-async def test_the_deployments_that_come_with_it_can_be_read(home: Home, name: str) -> None:
+async def test_the_shipped_deployments_can_be_read(home: Home, name: str) -> None:
     up = await home.run("up", name, "--host", "robto")
     known = {"three_hosts": "brain, operator, robot"}.get(name, "robot")
     assert up.err.endswith(f"known: {known}\n")
@@ -228,7 +228,7 @@ async def test_of_several_hosts_one_must_be_chosen(home: Home) -> None:
         ("decision:\n  behaviour: avod", 2, "avoid"),
     ],
 )
-async def test_what_is_wrong_in_a_file_is_said_with_its_line(
+async def test_errors_in_a_deployment_file_have_its_line(
     home: Home, text: str, line: int, named: str
 ) -> None:
     file = home.folder / "robot.yaml"
@@ -242,7 +242,7 @@ async def test_what_is_wrong_in_a_file_is_said_with_its_line(
 
 
 @pytest.mark.slow
-async def test_a_taken_port_is_said_in_one_line(home: Home) -> None:
+async def test_a_port_in_use_is_reported_in_one_line(home: Home) -> None:
     with socket.socket() as other:
         other.bind(("127.0.0.1", 0))
         other.listen()
@@ -257,8 +257,8 @@ async def test_a_taken_port_is_said_in_one_line(home: Home) -> None:
 
 
 @pytest.mark.parametrize("where", ["state", "run", "run_dir", "state-dir"])
-async def test_a_folder_that_cannot_be_written_is_said_in_one_line(home: Home, where: str) -> None:
-    """A file stands where the folder should be, which stops root as well."""
+async def test_an_unwritable_folder_is_reported_in_one_line(home: Home, where: str) -> None:
+    """A file is in the place of the folder, which also stops root."""
     place = home.folder / where
     place.write_text("")
     router = ("--connect", f"tcp/127.0.0.1:{free_port()}")

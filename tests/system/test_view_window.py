@@ -20,11 +20,11 @@ from gigabrain_zenoh.testing.waiting import until
 pytest.importorskip("glfw", reason="there is no GLFW here")
 XVFB = shutil.which("Xvfb")
 needs_xvfb = pytest.mark.skipif(XVFB is None, reason="there is no Xvfb here")
-HEADER_BYTES = 4096  # of an XWD file, at most; its pixels follow
+MAX_HEADER_BYTES = 4096  # at most, before the pixels of an XWD file
 
 
 class Display:
-    """An X server that keeps its picture in a file."""
+    """An X server that has its picture in a file."""
 
     def __init__(self, folder: Path) -> None:
         assert XVFB
@@ -41,7 +41,7 @@ class Display:
 
     def colours(self) -> int:
         """Return the number of colours on the screen."""
-        pixels = np.frombuffer(self._file.read_bytes()[HEADER_BYTES:][: 4 * 900 * 590], "<u4")
+        pixels = np.frombuffer(self._file.read_bytes()[MAX_HEADER_BYTES:][: 4 * 900 * 590], "<u4")
         return len(np.unique(pixels))
 
     def close(self) -> None:
@@ -68,7 +68,7 @@ def view(home: Home, endpoint: str, display: str = "") -> subprocess.Popen[str]:
 
 @needs_xvfb
 @pytest.mark.slow
-async def test_a_window_shows_the_running_simulation_which_never_waits_for_it(
+async def test_a_window_shows_the_simulation_without_delaying_it(
     shared_home: Home, display: Display
 ) -> None:
     hosts = {"robot": list(ROBOT)}
@@ -82,7 +82,7 @@ async def test_a_window_shows_the_running_simulation_which_never_waits_for_it(
             await until(lambda: display.colours() > 500, "the window is drawn")
             box = SimRequest(do="add", thing=Thing(x=2.8, y=-2.8, size=(0.2, 0.2, 0.5)))
             assert (await seen.bus.ask(SIM_CHANGE, box, timeout_s=5.0))[0].ok
-            window.send_signal(signal.SIGSTOP)  # a window that hangs holds nothing up
+            window.send_signal(signal.SIGSTOP)  # a hanging window delays nothing
             before = len(seen.states)
             await until(lambda: len(seen.states) > before + 100, "the robot goes on")
             window.send_signal(signal.SIGCONT)
@@ -93,7 +93,7 @@ async def test_a_window_shows_the_running_simulation_which_never_waits_for_it(
         robot.close()
 
 
-def test_without_a_display_one_line_says_what_to_do(shared_home: Home) -> None:
+def test_the_error_without_a_display_names_the_remedy(shared_home: Home) -> None:
     ended = view(shared_home, "tcp/127.0.0.1:1")
     out, _ = ended.communicate(timeout=60)
     assert ended.returncode == 2

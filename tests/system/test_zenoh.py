@@ -40,7 +40,7 @@ async def net() -> AsyncIterator[ZenohNetwork]:
         yield made
 
 
-async def test_what_is_sent_arrives_unchanged(net: ZenohNetwork) -> None:
+async def test_payloads_arrive_unchanged(net: ZenohNetwork) -> None:
     sender, receiver = await net.client(), await net.client()
     ear, star = (
         SampleCollector(receiver, "robot/teleop"),
@@ -80,7 +80,7 @@ async def test_messages_keep_their_order(net: ZenohNetwork) -> None:
     assert numbers == sorted(set(numbers))
 
 
-async def test_each_topic_goes_out_with_the_quality_of_service_of_its_line(
+async def test_each_topic_is_sent_with_its_own_quality_of_service(
     net: ZenohNetwork,
 ) -> None:
     samples: dict[str, zenoh.Sample] = {}
@@ -108,7 +108,7 @@ async def test_each_topic_goes_out_with_the_quality_of_service_of_its_line(
 
 @pytest.fixture
 def arrived(monkeypatch: pytest.MonkeyPatch) -> list[bytes]:
-    """Collect the payloads that have reached a mailbox."""
+    """Collect the payloads that reached a mailbox."""
     payloads: list[bytes] = []
 
     class Watched(Mailbox[zenoh.Sample]):
@@ -123,7 +123,7 @@ def arrived(monkeypatch: pytest.MonkeyPatch) -> list[bytes]:
 def publish_200_without_leaving_the_loop(
     sender: ZenohTransport, topic: Topic[Any], keys: list[str], arrived: list[bytes]
 ) -> None:
-    """Each goes out once the one before is in the mailbox."""
+    """Publish 200 numbers from the loop, each after the one before reached the mailbox."""
     deadline = time.monotonic() + 60
     for number in range(200):
         while b"%d" % number not in arrived and time.monotonic() < deadline:
@@ -158,7 +158,7 @@ async def test_a_busy_loop_gets_the_newest_of_each_key_of_a_pattern(
     assert ear.samples[:2] == [(keys[0], b"198"), (keys[1], b"199")]
 
 
-async def test_who_has_stopped_listening_hears_nothing(net: ZenohNetwork) -> None:
+async def test_a_closed_subscription_receives_nothing(net: ZenohNetwork) -> None:
     sender, receiver = await net.client(), await net.client()
     ear, other = (
         SampleCollector(receiver, "robot/teleop"),
@@ -170,7 +170,7 @@ async def test_who_has_stopped_listening_hears_nothing(net: ZenohNetwork) -> Non
     assert ear.samples == []
 
 
-async def test_a_message_on_the_bus_is_the_same_over_zenoh(net: ZenohNetwork) -> None:
+async def test_a_bus_message_is_unchanged_over_zenoh(net: ZenohNetwork) -> None:
     one, two = Bus(await net.client(), Clock(), "one"), Bus(await net.client(), Clock(), "two")
     states = two.latest(STATE)
     one.time.boot, one.time.tick = 7, 50
@@ -201,7 +201,7 @@ async def test_a_client_of_another_language_may_send_json(net: ZenohNetwork) -> 
     [b"\xc1" * 100, b'{"linear_x": NaN}', bytes(1_100), None],
     ids=["random", "nan", "oversized", "delete"],
 )
-async def test_what_a_hostile_client_sends_is_dropped_and_counted(
+async def test_hostile_payloads_are_dropped_and_counted(
     net: ZenohNetwork, payload: bytes | None
 ) -> None:
     bus, raw = Bus(await net.client(), Clock()), net.raw()
@@ -219,7 +219,7 @@ async def test_what_a_hostile_client_sends_is_dropped_and_counted(
     assert not bus.failed.done()
 
 
-async def test_what_is_far_too_large_ends_at_the_router(net: ZenohNetwork) -> None:
+async def test_far_too_large_payloads_are_dropped_by_the_router(net: ZenohNetwork) -> None:
     bus, raw = Bus(await net.client(), Clock()), net.raw()
     twists = bus.latest(TELEOP)
 
@@ -231,7 +231,7 @@ async def test_what_is_far_too_large_ends_at_the_router(net: ZenohNetwork) -> No
     assert bus.rejected["robot/teleop"] == 0
 
 
-async def test_nobody_is_more_urgent_than_what_he_says(net: ZenohNetwork) -> None:
+async def test_the_router_sets_the_priority_of_each_key(net: ZenohNetwork) -> None:
     samples: dict[str, zenoh.Sample] = {}
     net.raw().declare_subscriber("red/**", lambda s: samples.update({str(s.key_expr): s}))
     raw = net.raw()
@@ -254,20 +254,20 @@ async def test_nobody_is_more_urgent_than_what_he_says(net: ZenohNetwork) -> Non
     }
 
 
-async def test_a_sender_knows_whether_others_listen(net: ZenohNetwork) -> None:
+async def test_a_publisher_knows_whether_there_are_subscribers(net: ZenohNetwork) -> None:
     sender, receiver = await net.client(), await net.client()
-    told: list[bool] = []
-    close = sender.watch_readers("tf", told.append)
-    assert told == [False]
+    has_readers: list[bool] = []
+    close = sender.watch_readers("tf", has_readers.append)
+    assert has_readers == [False]
     end = receiver.subscribe("tf", lambda *_: None, 1)
-    await until(lambda: told[-1], "a reader")
+    await until(lambda: has_readers[-1], "a reader")
     end()
-    await until(lambda: not told[-1], "none")
+    await until(lambda: not has_readers[-1], "none")
     close()
     receiver.subscribe("tf", lambda *_: None, 1)
     ear = SampleCollector(receiver, "tf")
     await repeat(lambda: sender.publish(TELEOP, "tf", b"x", ""), lambda: ear.samples)
-    assert not told[-1]
+    assert not has_readers[-1]
 
 
 async def test_late_joiners_get_the_kept_value(net: ZenohNetwork) -> None:

@@ -35,7 +35,7 @@ async def echo(payload: bytes) -> tuple[bytes, str]:
     return payload, ""
 
 
-async def test_a_router_whose_port_is_taken_says_so_in_one_line() -> None:
+async def test_a_router_port_in_use_is_reported_in_one_line() -> None:
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
         taken.listen()
@@ -47,7 +47,7 @@ async def test_a_router_whose_port_is_taken_says_so_in_one_line() -> None:
     )
 
 
-async def test_a_router_that_cannot_listen_says_why_in_one_line() -> None:
+async def test_a_router_that_cannot_listen_reports_the_reason_in_one_line() -> None:
     with pytest.raises(BusError) as caught:
         await ZenohTransport.open(Endpoint(listen=("unixsock-stream//nowhere/at/all",)))
     assert str(caught.value).startswith("the router cannot listen on unixsock-stream//nowhere")
@@ -60,18 +60,18 @@ async def test_a_router_that_cannot_listen_says_why_in_one_line() -> None:
     ["foo", "", "tcp/127.0.0.1", "tcp/127.0.0.1:99999", "tcp/127.0.0.1:x", "http/127.0.0.1:80",
      "127.0.0.1:7447", "tcp//127.0.0.1:7447", "unixsock-stream/"],
 )  # fmt: skip
-async def test_what_is_no_endpoint_is_refused_instead_of_waited_for(text: str) -> None:
+async def test_an_invalid_endpoint_is_refused_at_once(text: str) -> None:
     with pytest.raises(ConfigError, match=r"is not a Zenoh endpoint; expected one like tcp/127"):
         await ZenohTransport.open(Endpoint(connect=(text,)))
 
 
-async def test_nowhere_to_go_is_refused() -> None:
+async def test_a_client_without_any_endpoint_is_refused() -> None:
     with pytest.raises(ConfigError, match="no router to connect to"):
         await ZenohTransport.open(Endpoint())
 
 
 @pytest.mark.parametrize("namespace", ["a//b", "/a", "a/", "a*", "robot/*", "a#b", "a?b"])
-async def test_what_is_no_namespace_is_refused_in_one_line(namespace: str) -> None:
+async def test_an_invalid_namespace_is_refused_in_one_line(namespace: str) -> None:
     with pytest.raises(ConfigError) as caught:
         await ZenohTransport.open(Endpoint(listen=(free_endpoint(),), namespace=namespace))
     text = str(caught.value)
@@ -91,7 +91,7 @@ async def test_a_client_waits_for_its_router() -> None:
         await client.close()
 
 
-async def test_waiting_for_a_router_may_be_given_up_and_its_session_is_closed() -> None:
+async def test_waiting_for_a_router_can_be_cancelled_and_closes_its_session() -> None:
     others = session_threads()
     async with robot() as net:
         opening = asyncio.ensure_future(client_of(net.endpoint))
@@ -100,11 +100,11 @@ async def test_waiting_for_a_router_may_be_given_up_and_its_session_is_closed() 
         with pytest.raises(asyncio.CancelledError):
             await opening
         await net.router()
-        # the thread that was left waiting finds the router, and lets go of it again
+        # the remaining thread finds the router and closes its session
         await until(lambda: session_threads() <= others)
 
 
-async def test_a_session_that_opens_just_as_it_is_given_up_is_closed() -> None:
+async def test_a_session_that_opens_during_its_cancellation_is_closed() -> None:
     others = session_threads()
     async with robot() as net:
         router = await net.router()
@@ -121,7 +121,7 @@ async def test_a_session_that_opens_just_as_it_is_given_up_is_closed() -> None:
         await until(lambda: not router._lines.now.session.info.transports())
 
 
-def test_a_process_that_gives_up_waiting_ends_by_itself() -> None:
+def test_a_process_that_stops_waiting_for_a_router_ends() -> None:
     program = f"""
 import asyncio
 from gigabrain_zenoh.config.settings import Endpoint
@@ -140,7 +140,7 @@ asyncio.run(main())
     assert (ended.stdout, ended.stderr, ended.returncode) == ("gave up\n", "", 0)
 
 
-async def test_a_router_that_is_killed_and_comes_back_carries_data_and_queries_again() -> None:
+async def test_data_and_queries_work_again_after_a_restart_of_the_router() -> None:
     endpoint = free_endpoint()
     with router_process(endpoint) as router:
         sender, receiver = await client_of(endpoint), await client_of(endpoint)
@@ -164,7 +164,7 @@ async def test_a_router_that_is_killed_and_comes_back_carries_data_and_queries_a
     assert b"lost" not in ear.payloads
 
 
-async def test_a_script_whose_router_dies_while_it_asks_for_a_goal_does_not_ask_again() -> None:
+async def test_a_goal_request_is_not_repeated_when_the_router_dies() -> None:
     endpoint, asked = free_endpoint(), asyncio.Event()
 
     async def never(_: bytes) -> tuple[bytes, str]:
@@ -185,25 +185,25 @@ async def test_a_script_whose_router_dies_while_it_asks_for_a_goal_does_not_ask_
         await client.close()
 
 
-async def test_a_sender_knows_of_readers_again_after_the_routers_restart() -> None:
+async def test_a_publisher_knows_its_subscribers_again_after_a_router_restart() -> None:
     endpoint = free_endpoint()
-    told: list[bool] = []
+    has_readers: list[bool] = []
     with router_process(endpoint) as router:
         sender, receiver = await client_of(endpoint), await client_of(endpoint)
-        sender.watch_readers("tf", told.append)
+        sender.watch_readers("tf", has_readers.append)
         ear = SampleCollector(receiver, "tf")
-        await until(lambda: told[-1], "a reader")
+        await until(lambda: has_readers[-1], "a reader")
         router.kill()
-    told.append(False)
+    has_readers.append(False)
     with router_process(endpoint):
-        await until(lambda: told[-1], "the reader again")
+        await until(lambda: has_readers[-1], "the reader again")
         ear.close()
-        await until(lambda: not told[-1], "none")
+        await until(lambda: not has_readers[-1], "none")
         await sender.close()
         await receiver.close()
 
 
-async def test_a_client_joins_again_with_a_session_of_which_its_router_knows_nothing() -> None:
+async def test_a_client_rejoins_after_its_router_forgot_its_session() -> None:
     endpoint = free_endpoint()
     with router_process(endpoint) as router:
         client = await client_of(endpoint)
@@ -217,7 +217,7 @@ async def test_a_client_joins_again_with_a_session_of_which_its_router_knows_not
         assert first
         assert second
         assert str(first.session.zid()) != str(second.session.zid())
-        ear.close()  # ends what was declared on the second
+        ear.close()  # undeclares on the second session
         received = len(ear.samples)
         other = SampleCollector(client, "robot/teleop")
         await repeat(lambda: client.publish(TELEOP, "robot/teleop", b"", ""), lambda: other.samples)
@@ -225,7 +225,7 @@ async def test_a_client_joins_again_with_a_session_of_which_its_router_knows_not
         await client.close()
 
 
-async def test_leaving_does_not_wait_to_join_again() -> None:
+async def test_closing_does_not_wait_for_a_reconnection() -> None:
     others = session_threads()
     endpoint = free_endpoint()
     with router_process(endpoint) as router:
@@ -237,17 +237,17 @@ async def test_leaving_does_not_wait_to_join_again() -> None:
         async with asyncio.timeout(5):
             await client.close()
             assert await asking == []
-    with router_process(endpoint):  # whoever still waits for one finds it, and leaves
+    with router_process(endpoint):  # lets a waiting thread connect and end
         await until(lambda: session_threads() <= others)
 
 
 def stuck(sender: ZenohTransport) -> None:
-    """Send more than the kernel takes, to a router that reads nothing."""
+    """Send more than the kernel buffers to a router that does not read."""
     for _ in range(200):
         sender.publish(SCAN, "robot/scan", bytes(100_000), "")
 
 
-async def gone(router_is: str, use: Callable[[ZenohTransport], None]) -> None:
+async def close_with_router(router_is: str, use: Callable[[ZenohTransport], None]) -> None:
     others = session_threads()
     endpoint = free_endpoint()
     with router_process(endpoint) as router:
@@ -258,28 +258,28 @@ async def gone(router_is: str, use: Callable[[ZenohTransport], None]) -> None:
         use(client)
         asking = asyncio.ensure_future(client.query("robot/goal", b"", "", 60.0, "data"))
         await asyncio.sleep(0)
-        async with asyncio.timeout(5):  # Zenoh's own close takes ten
+        async with asyncio.timeout(5):  # Zenoh's own close takes 10 s
             await client.close()
             assert await asking == []
     await until(lambda: session_threads() <= others)
 
 
 @pytest.mark.parametrize("router_is", ["killed", "frozen"])
-async def test_leaving_does_not_wait_for_a_router_that_is_gone(router_is: str) -> None:
-    await gone(router_is, lambda _: None)
+async def test_closing_does_not_wait_for_a_lost_router(router_is: str) -> None:
+    await close_with_router(router_is, lambda _: None)
 
 
-async def test_leaving_does_not_wait_for_a_link_that_is_stuck() -> None:
-    await gone("frozen", stuck)
+async def test_closing_does_not_wait_for_a_stuck_link() -> None:
+    await close_with_router("frozen", stuck)
 
 
-async def test_publishing_into_a_stuck_link_does_not_stop_the_loop() -> None:
+async def test_publishing_into_a_stuck_link_does_not_block_the_loop() -> None:
     others = session_threads()
     endpoint = free_endpoint()
     with router_process(endpoint) as router:
         client = await client_of(endpoint)
         router.freeze()
-        async with asyncio.timeout(60):  # a blocking publisher would need 5 s for each
+        async with asyncio.timeout(60):  # a blocking publisher would take 5 s each
             stuck(client)
             await asyncio.sleep(0)
         await client.close()
@@ -287,11 +287,11 @@ async def test_publishing_into_a_stuck_link_does_not_stop_the_loop() -> None:
 
 
 def handles() -> tuple[int, int]:
-    """Open descriptors, and threads: one per subscription and queryable."""
+    """Return the numbers of open descriptors and of threads; each subscription has a thread."""
     return len(os.listdir("/dev/fd")), threading.active_count()
 
 
-async def one_life() -> None:
+async def open_and_close_sessions() -> None:
     async with robot() as net:
         await net.router()
         one, two = await net.client(), await net.client("red")
@@ -303,13 +303,13 @@ async def one_life() -> None:
         await one.query("robot/goal", b"x", "", 5.0, "data")
 
 
-async def test_nothing_is_left_of_sessions_that_were_closed() -> None:
+async def test_closed_sessions_leave_no_descriptor_or_thread() -> None:
     threads = threading.active_count()
-    await one_life()  # what Zenoh itself opens stays for the next session
+    await open_and_close_sessions()  # Zenoh keeps some handles for the next session
     await until(lambda: threading.active_count() <= threads)
     gc.collect()
     before = handles()
     for _ in range(5):
-        await one_life()
+        await open_and_close_sessions()
     gc.collect()
     await until(lambda: all(now <= then for now, then in zip(handles(), before, strict=True)))

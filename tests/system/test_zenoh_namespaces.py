@@ -22,7 +22,9 @@ async def describe(_: DescribeRequest) -> Description:
     return example(Description)
 
 
-async def test_two_robots_on_one_router_do_not_hear_each_other(net: ZenohNetwork) -> None:
+async def test_two_robots_on_one_router_do_not_receive_each_others_messages(
+    net: ZenohNetwork,
+) -> None:
     await net.router()
     red, blue = await net.client("red"), await net.client("blue")
     red_ear, blue_ear = (
@@ -39,7 +41,7 @@ async def test_two_robots_on_one_router_do_not_hear_each_other(net: ZenohNetwork
     assert set(blue_ear.samples) == {("robot/teleop", b"blue")}
 
 
-async def test_the_fleet_hears_each_robot_under_its_name(net: ZenohNetwork) -> None:
+async def test_the_fleet_receives_each_robot_under_its_name(net: ZenohNetwork) -> None:
     await net.router()
     red, fleet = await net.client("red"), await net.client()
     ear = SampleCollector(fleet, "red/robot/*")
@@ -47,7 +49,7 @@ async def test_the_fleet_hears_each_robot_under_its_name(net: ZenohNetwork) -> N
     assert set(ear.samples) == {("red/robot/teleop", b"x")}
 
 
-async def test_a_question_stays_within_its_robot(net: ZenohNetwork) -> None:
+async def test_a_query_stays_within_its_robot(net: ZenohNetwork) -> None:
     await net.router()
     red, blue = Bus(await net.client("red"), Clock()), Bus(await net.client("blue"), Clock())
     asker = Bus(await net.client("red"), Clock())
@@ -60,7 +62,7 @@ async def test_a_question_stays_within_its_robot(net: ZenohNetwork) -> None:
 
 
 async def test_a_router_in_a_namespace_is_one_of_the_robots_processes(net: ZenohNetwork) -> None:
-    """It answers and reports there, and still joins those of any other namespace."""
+    """It replies and publishes in its namespace, and still connects those of other namespaces."""
     router = Bus(await net.router("red"), Clock(), "router")
     red, fleet = Bus(await net.client("red"), Clock()), await net.client()
     received: list[tuple[str, Health]] = []
@@ -81,7 +83,7 @@ async def test_a_router_in_a_namespace_is_one_of_the_robots_processes(net: Zenoh
     assert not await Bus(blue, Clock()).ask(DESCRIBE, DescribeRequest(), name="router")
 
 
-async def test_a_router_in_a_namespace_hears_its_robot(net: ZenohNetwork) -> None:
+async def test_a_router_in_a_namespace_receives_its_robot(net: ZenohNetwork) -> None:
     router, red = await net.router("red"), await net.client("red")
     ear = SampleCollector(router, "robot/teleop")
     await repeat(lambda: red.publish(TELEOP, "robot/teleop", b"x", ""), lambda: ear.samples)

@@ -28,8 +28,8 @@ async def refuse(payload: bytes) -> tuple[bytes, str]:
     raise Refused(f"not {payload.decode()}: ümläut")
 
 
-class Late:
-    """Answers after a minute."""
+class SlowService:
+    """A service that replies after a minute."""
 
     def __init__(self) -> None:
         self.began = asyncio.Event()
@@ -40,7 +40,7 @@ class Late:
         return b"", ""
 
     async def asked_by(self, asker: ZenohTransport) -> "asyncio.Future[list[bytes | str]]":
-        """A question of `asker` that has come here and waits for its answer."""
+        """Return a pending query of `asker` that has arrived here."""
         async with asyncio.timeout(30):
             while True:
                 asking = asyncio.ensure_future(asker.query("robot/goal", b"", "", 60.0, "data"))
@@ -48,13 +48,13 @@ class Late:
                 await asyncio.wait((asking, begun), return_when=asyncio.FIRST_COMPLETED)
                 if not asking.done():
                     return asking
-                begun.cancel()  # asked before the server was known
+                begun.cancel()  # the query was sent before the server was known
 
 
 async def ask(
     transport: ZenohTransport, key: str, payload: bytes = b"", wanted: int = 1
 ) -> list[bytes | str]:
-    """Ask until as many as wanted are known to the network and have answered."""
+    """Repeat a query until it has as many replies as wanted."""
     async with asyncio.timeout(30):
         while True:
             replies = await transport.query(key, payload, "", 5.0, "data")
@@ -62,7 +62,7 @@ async def ask(
                 return replies
 
 
-async def test_a_query_has_its_answer(net: ZenohNetwork) -> None:
+async def test_a_query_gets_its_reply(net: ZenohNetwork) -> None:
     server, asker = await net.client(), await net.client()
     server.serve("robot/goal", echo)
     assert await ask(asker, "robot/goal", b"abc") == [b"cba"]
@@ -70,7 +70,7 @@ async def test_a_query_has_its_answer(net: ZenohNetwork) -> None:
     assert await ask(asker, "robot/goal", bytes(64 * 1024)) == [bytes(64 * 1024)]
 
 
-async def test_a_kept_value_of_a_megabyte_is_answered_whole(net: ZenohNetwork) -> None:
+async def test_a_reply_of_a_megabyte_arrives_whole(net: ZenohNetwork) -> None:
     async def answer(_: bytes) -> tuple[bytes, str]:
         return bytes(range(256)) * 4096, ""
 
@@ -85,20 +85,20 @@ async def test_a_refusal_is_a_text(net: ZenohNetwork) -> None:
     assert await ask(asker, "robot/goal", b"now") == ["not now: ümläut"]
 
 
-async def test_a_query_that_nobody_serves_has_no_answer(net: ZenohNetwork) -> None:
+async def test_a_query_without_a_server_has_no_reply(net: ZenohNetwork) -> None:
     asker = await net.client()
     assert await asker.query("robot/goal", b"", "", 30.0, "data") == []
 
 
-async def test_an_answer_that_is_late_is_none(net: ZenohNetwork) -> None:
-    late = Late()
+async def test_a_late_reply_is_dropped(net: ZenohNetwork) -> None:
+    slow = SlowService()
     server, asker = await net.client(), await net.client()
-    server.serve("robot/goal", late.answer)
-    while not late.began.is_set():
+    server.serve("robot/goal", slow.answer)
+    while not slow.began.is_set():
         assert await asker.query("robot/goal", b"", "", 0.2, "data") == []
 
 
-async def test_all_who_serve_a_key_answer(net: ZenohNetwork) -> None:
+async def test_all_servers_of_a_key_reply(net: ZenohNetwork) -> None:
     one, two, asker = await net.client(), await net.client(), await net.client()
     one.serve("robot/goal", echo)
     two.serve("robot/goal", refuse)
@@ -120,7 +120,7 @@ async def test_a_session_answers_its_own_queries(net: ZenohNetwork) -> None:
     assert await ask(client, "robot/goal", b"ab") == [b"ba"]
 
 
-async def test_who_serves_no_more_does_not_answer(net: ZenohNetwork) -> None:
+async def test_a_closed_service_does_not_reply(net: ZenohNetwork) -> None:
     server, asker = await net.client(), await net.client()
     close = server.serve("robot/goal", echo)
     server.serve("robot/mission", echo)
@@ -131,31 +131,31 @@ async def test_who_serves_no_more_does_not_answer(net: ZenohNetwork) -> None:
     assert await ask(asker, "robot/goal", b"ab", 0) == []
 
 
-async def test_an_asker_gets_nothing_at_once_when_the_server_leaves(net: ZenohNetwork) -> None:
-    late = Late()
+async def test_a_query_ends_at_once_when_its_server_closes(net: ZenohNetwork) -> None:
+    slow = SlowService()
     server, asker = await net.client(), await net.client()
-    server.serve("robot/goal", late.answer)
-    asking = await late.asked_by(asker)
+    server.serve("robot/goal", slow.answer)
+    asking = await slow.asked_by(asker)
     await server.close()
-    async with asyncio.timeout(20):  # less than the asker's own patience
+    async with asyncio.timeout(20):  # less than the timeout of the query
         assert await asking == []
 
 
-async def test_an_asker_that_leaves_does_not_wait(net: ZenohNetwork) -> None:
+async def test_closing_a_client_does_not_wait_for_its_query(net: ZenohNetwork) -> None:
     server, asker = await net.client(), await net.client()
-    late = Late()
-    server.serve("robot/goal", late.answer)
-    asking = await late.asked_by(asker)
+    slow = SlowService()
+    server.serve("robot/goal", slow.answer)
+    asking = await slow.asked_by(asker)
     await asker.close()
     async with asyncio.timeout(10):
         assert await asking == []
 
 
-async def test_an_asker_that_is_cancelled_leaves_nothing_behind(net: ZenohNetwork) -> None:
+async def test_a_cancelled_query_does_not_block_later_ones(net: ZenohNetwork) -> None:
     server, asker = await net.client(), await net.client()
-    late = Late()
-    server.serve("robot/goal", late.answer)
-    asking = await late.asked_by(asker)
+    slow = SlowService()
+    server.serve("robot/goal", slow.answer)
+    asking = await slow.asked_by(asker)
     asking.cancel()
     with pytest.raises(asyncio.CancelledError):
         await asking
@@ -163,7 +163,7 @@ async def test_an_asker_that_is_cancelled_leaves_nothing_behind(net: ZenohNetwor
     assert await ask(asker, "robot/mission", b"ab") == [b"ba"]
 
 
-async def test_a_question_on_the_bus_crosses_zenoh_and_so_does_its_answer(
+async def test_requests_and_replies_of_the_bus_work_over_zenoh(
     net: ZenohNetwork,
 ) -> None:
     async def answer(request: EstopRequest) -> GateReply:
@@ -182,7 +182,7 @@ async def test_a_question_on_the_bus_crosses_zenoh_and_so_does_its_answer(
         await two.ask(ESTOP, EstopRequest(reason="fun"), timeout_s=20)
 
 
-async def test_garbage_is_refused_over_zenoh_in_words(net: ZenohNetwork) -> None:
+async def test_an_invalid_request_over_zenoh_is_refused_with_a_reason(net: ZenohNetwork) -> None:
     async def answer(_: EstopRequest) -> GateReply:
         return GateReply(ok=True, text="", robot_type="mock", gate=GateStatus())
 

@@ -1,9 +1,8 @@
-"""Reads a URDF by Pinocchio, for `test_arm_judges.py`: `python urdf_judge.py FILE`.
+"""Read a URDF by Pinocchio, for `test_arm_judges.py`: `python urdf_judge.py FILE`.
 
-Its parser of URDFs is urdfdom, as RViz's is. FILE is JSON: `urdf`, `postures` with the position of
-each joint by name, and the `frames` to tell of. Prints, as JSON, the poses (4, 4) of those frames
-at each posture, the mass, centre and inertia of all together at the last one, and the limits of
-each joint.
+Pinocchio parses with urdfdom, as RViz does. FILE is JSON: `urdf`, `postures` with the position of
+each joint by name, and names of `frames`. Prints JSON: the poses (4, 4) of those frames at each
+posture, mass, centre and inertia of the whole at the last posture, and the limits of each joint.
 """
 
 import json
@@ -14,9 +13,9 @@ import numpy as np
 import pinocchio
 
 given = json.loads(Path(sys.argv[1]).read_text())
-root = pinocchio.JointModelFreeFlyer()  # so that what does not move has a mass as well
+root = pinocchio.JointModelFreeFlyer()  # else fixed parts have no mass
 model = pinocchio.buildModelFromXML(given["urdf"], root)
-data, body = model.createData(), pinocchio.FrameType.BODY  # joints may have the same names
+data, body = model.createData(), pinocchio.FrameType.BODY  # joints may have equal names
 frames, places = [model.getFrameId(name, body) for name in given["frames"]], []
 for posture in given["postures"]:
     q = pinocchio.neutral(model)

@@ -1,6 +1,6 @@
-"""Talks to an arm with feetech-servo-sdk 1.0.0: `python feetech_servo_sdk.py PORT SECONDS`.
+"""Talk to an arm with feetech-servo-sdk 1.0.0: `python feetech_servo_sdk.py PORT SECONDS`.
 
-It gives up after 34 ms, which a busy machine may need for an answer; so each call is repeated.
+The SDK gives up after 34 ms; a busy machine may answer later, so each call is repeated.
 """
 
 import json
@@ -18,8 +18,8 @@ line = sdk.PortHandler(sys.argv[1])
 bus = sdk.PacketHandler(0)
 
 
-def patient(call: Callable[..., Any], *arguments: Any) -> Any:
-    """Call until there is an answer; the result is the last but one value, or the only one."""
+def call_until_success(call: Callable[..., Any], *arguments: Any) -> Any:
+    """Call until the SDK reports success; its result is the last but one value, or the only one."""
     for _ in range(ATTEMPTS):
         line.ser.reset_input_buffer()
         answer = call(*arguments)
@@ -31,25 +31,25 @@ def patient(call: Callable[..., Any], *arguments: Any) -> Any:
 
 def main() -> None:
     assert line.openPort()
-    pings = [patient(bus.ping, line, servo) for servo in SERVOS]
-    before = [patient(bus.read2ByteTxRx, line, servo, POSITION)[0] for servo in SERVOS]
+    pings = [call_until_success(bus.ping, line, servo) for servo in SERVOS]
+    before = [call_until_success(bus.read2ByteTxRx, line, servo, POSITION)[0] for servo in SERVOS]
     for servo in (1, 2, 3):
-        patient(bus.write1ByteTxRx, line, servo, TORQUE, 1)
-    written = patient(bus.write2ByteTxRx, line, 1, GOAL, 2200)
+        call_until_success(bus.write1ByteTxRx, line, servo, TORQUE, 1)
+    written = call_until_success(bus.write2ByteTxRx, line, 1, GOAL, 2200)
     group = sdk.GroupSyncWrite(line, bus, GOAL, 2)
     for servo, goal in ((2, 1400), (3, 2600)):
         assert group.addParam(servo, list(goal.to_bytes(2, "little")))
     assert group.txPacket() == sdk.COMM_SUCCESS
     time.sleep(float(sys.argv[2]))
-    together = sdk.GroupSyncRead(line, bus, POSITION, 2)
+    sync_read = sdk.GroupSyncRead(line, bus, POSITION, 2)
     for servo in SERVOS:
-        together.addParam(servo)
-    read = patient(together.txRxPacket)
+        sync_read.addParam(servo)
+    read = call_until_success(sync_read.txRxPacket)
     print(json.dumps({
         "models": [model for model, _, _ in pings],
         "results": [result for _, result, _ in pings] + [*written, read],
         "before": before,
-        "after": [together.getData(servo, POSITION, 2) for servo in SERVOS],
+        "after": [sync_read.getData(servo, POSITION, 2) for servo in SERVOS],
         "missing": bus.ping(line, 7)[1],
     }))  # fmt: skip
 

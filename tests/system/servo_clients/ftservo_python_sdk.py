@@ -1,6 +1,6 @@
-"""Talks to an arm with ftservo-python-sdk 2.0.1: `python ftservo_python_sdk.py PORT SECONDS`.
+"""Talk to an arm with ftservo-python-sdk 2.0.1: `python ftservo_python_sdk.py PORT SECONDS`.
 
-It gives up after 34 ms, which a busy machine may need for an answer; so each call is repeated.
+The SDK gives up after 34 ms; a busy machine may answer later, so each call is repeated.
 """
 
 import json
@@ -17,8 +17,8 @@ line = sdk.PortHandler(sys.argv[1])
 bus = sdk.sms_sts(line)
 
 
-def patient(call: Callable[..., Any], *arguments: Any) -> Any:
-    """Call until there is an answer; the result is the last but one value, or the only one."""
+def call_until_success(call: Callable[..., Any], *arguments: Any) -> Any:
+    """Call until the SDK reports success; its result is the last but one value, or the only one."""
     for _ in range(ATTEMPTS):
         line.ser.reset_input_buffer()
         answer = call(*arguments)
@@ -30,24 +30,24 @@ def patient(call: Callable[..., Any], *arguments: Any) -> Any:
 
 def main() -> None:
     assert line.openPort()
-    pings = [patient(bus.ping, servo) for servo in SERVOS]
-    before = [patient(bus.ReadPos, servo)[0] for servo in SERVOS]
+    pings = [call_until_success(bus.ping, servo) for servo in SERVOS]
+    before = [call_until_success(bus.ReadPos, servo)[0] for servo in SERVOS]
     for servo in (1, 2, 3):
-        patient(bus.write1ByteTxRx, servo, sdk.SMS_STS_TORQUE_ENABLE, 1)
-    written = patient(bus.WritePosEx, 1, 2200, 1500, 100)
+        call_until_success(bus.write1ByteTxRx, servo, sdk.SMS_STS_TORQUE_ENABLE, 1)
+    written = call_until_success(bus.WritePosEx, 1, 2200, 1500, 100)
     for servo, goal in ((2, 1400), (3, 2600)):
         assert bus.SyncWritePosEx(servo, goal, 1500, 100)
     assert bus.groupSyncWrite.txPacket() == sdk.COMM_SUCCESS
     time.sleep(float(sys.argv[2]))
-    together = sdk.GroupSyncRead(bus, sdk.SMS_STS_PRESENT_POSITION_L, 4)
+    sync_read = sdk.GroupSyncRead(bus, sdk.SMS_STS_PRESENT_POSITION_L, 4)
     for servo in SERVOS:
-        together.addParam(servo)
-    read = patient(together.txRxPacket)
+        sync_read.addParam(servo)
+    read = call_until_success(sync_read.txRxPacket)
     print(json.dumps({
         "models": [model for model, _, _ in pings],
         "results": [result for _, result, _ in pings] + [*written, read],
         "before": before,
-        "after": [together.getData(s, sdk.SMS_STS_PRESENT_POSITION_L, 2) for s in SERVOS],
+        "after": [sync_read.getData(s, sdk.SMS_STS_PRESENT_POSITION_L, 2) for s in SERVOS],
         "missing": bus.ping(7)[1],
     }))  # fmt: skip
 

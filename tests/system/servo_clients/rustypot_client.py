@@ -1,4 +1,4 @@
-"""Talks to an arm with rustypot 1.13.1: `python rustypot_client.py PORT SECONDS`."""
+"""Talk to an arm with rustypot 1.13.1: `python rustypot_client.py PORT SECONDS`."""
 
 import json
 import sys

@@ -1,4 +1,4 @@
-"""Emulated devices behind a proxy that brings their bytes late, in real time."""
+"""Emulated devices behind a proxy that delays their bytes, in real time."""
 
 import asyncio
 import itertools
@@ -23,7 +23,7 @@ from gigabrain_zenoh.testing.waiting import until
 from tests.system.lidars import LIDAR, Listener, emulated
 
 
-async def test_an_emulated_ld19_behind_a_late_line_says_so(tmp_path: Path) -> None:
+async def test_scans_of_an_ld19_report_the_delay_of_its_line(tmp_path: Path) -> None:
     device = ScanOptions(driver="ld19", port=str(tmp_path / "scan"))
     behind = ScanOptions(driver="ld19", port=str(tmp_path / "behind"))
     async with (
@@ -39,19 +39,23 @@ async def test_an_emulated_ld19_behind_a_late_line_says_so(tmp_path: Path) -> No
         await until(lambda: listener.scans[-1].late_ms < 40.0)
 
 
-class Swaying:
-    """A base on a text line that is told one way and the other, and how late it follows."""
+class OscillatingBase:
+    """A base on a text line, commanded to and fro; measures the delay of its speed."""
 
     def __init__(self, driver: LineDriver) -> None:
         self.driver, self.lag = driver, SpeedDelay()
 
     async def run(self) -> None:
-        told, limits, begin = Velocity(), limits_of(self.driver.robot), asyncio.get_running_loop()
+        commanded, limits, begin = (
+            Velocity(),
+            limits_of(self.driver.robot),
+            asyncio.get_running_loop(),
+        )
         start_s, last = begin.time(), 0
         for step in itertools.count():
             to = Velocity(linear_x=0.3 if step % 60 < 30 else -0.3)
-            told = ramp(told, to, limits, TICK_S)
-            sent = await self.driver.set_base_velocity(told.linear_x, 0.0, 0.0)
+            commanded = ramp(commanded, to, limits, TICK_S)
+            sent = await self.driver.set_base_velocity(commanded.linear_x, 0.0, 0.0)
             await asyncio.sleep(TICK_S)
             tick = round((begin.time() - start_s) / TICK_S)
             state = replace(await self.driver.read_state(), tick=tick, sent=sent)
@@ -62,12 +66,12 @@ class Swaying:
 
 
 @asynccontextmanager
-async def swaying(bench: EmulatedLine, port: Path) -> AsyncIterator[Swaying]:
+async def oscillating_base(bench: EmulatedLine, port: Path) -> AsyncIterator[OscillatingBase]:
     options = replace(bench.driver.options, port=str(port))
     driver = LineDriver(bench.robot, options, bench.driver.run)
     bench.station.start()
     async with driver:
-        body = Swaying(driver)
+        body = OscillatingBase(driver)
         task = asyncio.create_task(body.run())
         yield body
         task.cancel()
@@ -75,11 +79,11 @@ async def swaying(bench: EmulatedLine, port: Path) -> AsyncIterator[Swaying]:
     await bench.station.close()
 
 
-async def test_a_base_without_a_clock_is_seen_to_follow_late(tmp_path: Path) -> None:
+async def test_the_delay_of_a_base_without_a_clock_is_measured(tmp_path: Path) -> None:
     bench, port = EmulatedLine(tmp_path), tmp_path / "behind"
     async with (
         LineProxy(str(tmp_path / "base"), port) as proxy,
-        swaying(bench, port) as body,
+        oscillating_base(bench, port) as body,
     ):
         await until(body.is_late(0, 4))
         proxy.set(Chaos(delay_ms=50.0))

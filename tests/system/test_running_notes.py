@@ -1,4 +1,4 @@
-"""Notes of running robots, which supervisors leave on this machine."""
+"""Notes of running robots, which supervisors write on this machine."""
 
 import subprocess
 import sys
@@ -15,7 +15,7 @@ def notes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return folder()
 
 
-def test_the_note_of_a_dead_supervisor_is_taken_away(notes: Path) -> None:
+def test_the_note_of_a_dead_supervisor_is_removed(notes: Path) -> None:
     program = (
         "import os\nfrom gigabrain_zenoh.runtime.running import announced, Endpoint\n"
         "with announced('ghost', Endpoint(connect=('tcp/127.0.0.1:1',))): os.kill(os.getpid(), 9)"

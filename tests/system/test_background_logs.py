@@ -1,4 +1,4 @@
-"""Writing logs holds up nothing: not the event loop, not the end of the process."""
+"""Writing logs blocks neither the event loop nor the end of the process."""
 
 import fcntl
 import json
@@ -10,7 +10,7 @@ from pathlib import Path
 PIPE_BYTES = 4096
 
 
-def test_a_console_that_nobody_reads_does_not_keep_a_process_from_ending() -> None:
+def test_a_process_ends_although_its_console_is_not_read() -> None:
     program = (
         "import logging, os; from gigabrain_zenoh import logs; "
         "logs.setup('driver', None, json_console=True); "
@@ -26,7 +26,7 @@ def test_a_console_that_nobody_reads_does_not_keep_a_process_from_ending() -> No
     assert done.returncode == 7
 
 
-def test_last_words_are_written_before_a_process_ends(tmp_path: Path) -> None:
+def test_all_log_lines_are_written_before_a_process_ends(tmp_path: Path) -> None:
     program = (
         "import logging, os, sys; from pathlib import Path; from gigabrain_zenoh import logs; "
         "logs.setup('driver', Path(sys.argv[1]), json_console=True); "
@@ -35,8 +35,8 @@ def test_last_words_are_written_before_a_process_ends(tmp_path: Path) -> None:
     done = subprocess.run(
         (sys.executable, "-c", program, str(tmp_path)), capture_output=True, text=True
     )
-    said = [json.loads(line)["text"] for line in done.stderr.splitlines()]
+    logged = [json.loads(line)["text"] for line in done.stderr.splitlines()]
     written = [
         json.loads(line)["text"] for line in (tmp_path / "driver.jsonl").read_text().splitlines()
     ]
-    assert said == written == [f"line {i}" for i in range(500)]
+    assert logged == written == [f"line {i}" for i in range(500)]

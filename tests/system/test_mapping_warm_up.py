@@ -25,7 +25,7 @@ print(len(before), sorted(compiled() - before))
 """
 
 
-def test_a_map_is_made_without_compiling_anything_after_the_start() -> None:
+def test_mapping_compiles_nothing_after_its_warm_up() -> None:
     drive = subprocess.run(
         [sys.executable, "-c", DRIVE], capture_output=True, text=True, check=True
     )

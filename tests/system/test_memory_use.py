@@ -1,4 +1,4 @@
-"""A process that has planned in large maps is small again afterwards."""
+"""Memory of large arrays and of start-up code goes back to the system."""
 
 import subprocess
 import sys
@@ -34,7 +34,7 @@ for _ in range(3):
         thread.join()
 print(held_mb() - before)
 """
-LEFT_MB = 5.0
+MAX_GROWTH_MB = 5.0
 PICTURES = """
 import resource, sys
 import numpy as np
@@ -57,7 +57,7 @@ print(resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before)
 
 
 def grown_mb(*words: str) -> float:
-    """By how much a process grows that has held large arrays in threads [MB]."""
+    """Return how much larger a process stays after large arrays in threads [MB]."""
     done = subprocess.run(
         (sys.executable, "-c", MAPS, *words), capture_output=True, text=True, check=True
     )
@@ -66,11 +66,11 @@ def grown_mb(*words: str) -> float:
 
 @pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
 def test_large_blocks_go_back_to_the_system() -> None:
-    assert grown_mb("mapped") < LEFT_MB
+    assert grown_mb("mapped") < MAX_GROWTH_MB
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="glibc's heap")
-def test_what_each_picture_needs_stays_in_the_heap() -> None:
+def test_memory_needed_for_each_picture_stays_in_the_heap() -> None:
     done = subprocess.run(
         (sys.executable, "-c", PICTURES), capture_output=True, text=True, check=True
     )
@@ -100,7 +100,7 @@ print(before, code_kb())
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="Linux tells what is mapped")
-def test_code_that_only_the_start_has_run_is_unmapped() -> None:
+def test_code_used_only_at_the_start_is_unmapped() -> None:
     pytest.importorskip("gtsam")
     done = subprocess.run((sys.executable, "-c", CODE), capture_output=True, text=True)
     assert done.returncode == 0, done.stderr

@@ -1,4 +1,4 @@
-"""A router's door: strangers and denials are seen, and written down within a second."""
+"""The audit of a router: strangers and denied requests are logged within a second."""
 
 import asyncio
 import contextlib
@@ -22,8 +22,8 @@ from gigabrain_zenoh.testing.waiting import until
 from tests.system.keys import make_fleet, raw
 
 
-class Gate:
-    """`gigabrain up` with a router and nothing else, for the robot red."""
+class RouterOfRed:
+    """`gigabrain up` with only a router, for the robot red."""
 
     def __init__(self, home: Home, fleet: Path) -> None:
         self.port, self.fleet = free_port(), fleet
@@ -36,7 +36,7 @@ class Gate:
         self._robot = home.folder / "state" / "gigabrain" / "robots" / "red"
         self.command: CommandProcess = home.start("up", str(file))
 
-    def as_(self, name: str) -> Endpoint:
+    def endpoint_of(self, name: str) -> Endpoint:
         return Endpoint(
             connect=(f"tcp/127.0.0.1:{self.port}",), keys=str(self.fleet / name) if name else ""
         )
@@ -48,23 +48,26 @@ class Gate:
 
 
 @pytest.fixture(scope="module")
-def started(shared_home: Home, fleet: Path) -> Iterator[Gate]:
-    made = Gate(shared_home, fleet)
+def started(shared_home: Home, fleet: Path) -> Iterator[RouterOfRed]:
+    made = RouterOfRed(shared_home, fleet)
     yield made
     made.command.close()
 
 
 @pytest.fixture
-async def gate(started: Gate) -> Gate:
+async def gate(started: RouterOfRed) -> RouterOfRed:
     await until(lambda: "ready" in started.command.out, "the router is ready")
     return started
 
 
-async def test_denials_and_strangers_are_in_the_audit_log(gate: Gate, tmp_path: Path) -> None:
-    with raw(gate.as_("viewer@red")) as viewer, raw(gate.as_("robot@blue")) as blue:
+async def test_denied_requests_and_strangers_are_in_the_audit_log(
+    gate: RouterOfRed, tmp_path: Path
+) -> None:
+    with raw(gate.endpoint_of("viewer@red")) as viewer, raw(gate.endpoint_of("robot@blue")) as blue:
         for _ in range(200):
             viewer.put("red/robot/cmd_vel", b"x")
-        viewer.put('red/robot/x\n{"event":"ready","pid":1}\n', b"x")  # no word to the supervisor
+        # must not reach the supervisor
+        viewer.put('red/robot/x\n{"event":"ready","pid":1}\n', b"x")
         assert list(viewer.get("red/robot/release", timeout=5.0)) == []
         blue.put("red/robot/cmd_vel", b"x")
         assert list(blue.get("red/robot/estop", timeout=5.0)) == []
@@ -74,17 +77,17 @@ async def test_denials_and_strangers_are_in_the_audit_log(gate: Gate, tmp_path: 
         }
         await until(lambda: wanted <= set(gate.audited), "they are written down")
     for keys in (make_fleet(tmp_path / "other", "other") / "operator", None):
-        at = Endpoint(connect=gate.as_("").connect, keys=str(keys) if keys else "")
+        at = Endpoint(connect=gate.endpoint_of("").connect, keys=str(keys) if keys else "")
         with pytest.raises(zenoh.ZError), raw(at):
             pass
-    # How TLS names what is no TLS hangs on a few bytes: one session id in 256 is a byte shorter.
+    # the rest of TLS's error depends on the bytes: one session id in 256 is a byte shorter
     whys = ("received fatal alert: UnknownCA", "received corrupt message of type ")
 
-    def turned_away() -> bool:
+    def are_audited() -> bool:
         codes = [code for what, who, code in gate.audited if (what, who) == ("stranger", "unknown")]
         return all(any(code.startswith(why) for code in codes) for why in whys)
 
-    await until(turned_away, "so are those outside")
+    await until(are_audited, "so are those outside")
     record = gate.audited["refused", "viewer@red", "put robot/cmd_vel"]
     assert record.text.startswith("viewer@red at tls/127.0.0.1:")
     assert record.text.endswith(" may not put red/robot/cmd_vel")
@@ -92,9 +95,12 @@ async def test_denials_and_strangers_are_in_the_audit_log(gate: Gate, tmp_path: 
     assert gate.command.out.count("ready") == 1
 
 
-async def test_what_is_allowed_is_not_audited(gate: Gate) -> None:
+async def test_allowed_requests_are_not_audited(gate: RouterOfRed) -> None:
     before = set(gate.audited)
-    with raw(gate.as_("robot@red")) as robot, raw(gate.as_("operator@red")) as operator:
+    with (
+        raw(gate.endpoint_of("robot@red")) as robot,
+        raw(gate.endpoint_of("operator@red")) as operator,
+    ):
         received: list[bytes] = []
         operator.declare_subscriber("red/robot/**", lambda s: received.append(s.payload.to_bytes()))
         async with asyncio.timeout(30):
@@ -102,14 +108,14 @@ async def test_what_is_allowed_is_not_audited(gate: Gate) -> None:
                 robot.put("red/robot/state", b"x")
                 await asyncio.sleep(0.02)
         operator.put("red/robot/teleop", b"x")
-        operator.put("red/robot/state", b"denied")  # comes last, so what was before is known
+        operator.put("red/robot/state", b"denied")  # its audit record comes last
         last = ("refused", "operator@red", "put robot/state")
         await until(lambda: last in gate.audited, "the denial is written down")
     assert set(gate.audited) - before == {last}
 
 
-async def test_nothing_listens_but_the_router_and_a_socket_of_its_user(
-    gate: Gate, shared_home: Home
+async def test_only_the_router_port_and_a_private_socket_listen(
+    gate: RouterOfRed, shared_home: Home
 ) -> None:
     pids = [gate.command.pid, *shared_home.processes()]
     listening = [
@@ -125,7 +131,7 @@ async def test_nothing_listens_but_the_router_and_a_socket_of_its_user(
     assert stat.S_IMODE(os.stat(os.path.dirname(path)).st_mode) == 0o700
 
 
-async def test_who_may_not_ask_is_told_so(gate: Gate) -> None:
+async def test_a_client_without_rights_gets_an_error_with_that_reason(gate: RouterOfRed) -> None:
     at = f"tls/127.0.0.1:{gate.port}"
     keys = str(gate.fleet / "viewer@red")
     with pytest.raises(NotConfirmed, match=r"or viewer@red may not ask for it"):
@@ -133,21 +139,21 @@ async def test_who_may_not_ask_is_told_so(gate: Gate) -> None:
             await robot.estop()
 
 
-async def test_1100_connections_that_fail_keep_nobody_out_who_comes_by_the_socket(
-    gate: Gate, shared_home: Home
+async def test_1100_failing_tls_connections_do_not_block_the_local_socket(
+    gate: RouterOfRed, shared_home: Home
 ) -> None:
-    """Comes last: Zenoh lets no more than ten a second fail, so TLS is busy for two minutes."""
+    """Must run last: Zenoh rejects ten connections a second, so TLS is busy for two minutes."""
     near = await robot_of(shared_home, gate.command)
     local = Endpoint(connect=near.connect[:1])
-    with raw(gate.as_("operator@red")) as operator:
+    with raw(gate.endpoint_of("operator@red")) as operator:
         received: list[bytes] = []
         operator.declare_subscriber(
             "red/robot/state", lambda s: received.append(s.payload.to_bytes())
         )
 
-        async def is_heard() -> None:
+        async def robot_is_received() -> None:
             received.clear()
-            with raw(local) as robot:  # refused at once where there is no room
+            with raw(local) as robot:  # would be refused at once without a free slot
                 async with asyncio.timeout(30):
                     while not received:
                         robot.put("red/robot/state", b"x")
@@ -156,6 +162,6 @@ async def test_1100_connections_that_fail_keep_nobody_out_who_comes_by_the_socke
         with contextlib.ExitStack() as crowd:
             for _ in range(1100):
                 crowd.enter_context(socket.create_connection(("127.0.0.1", gate.port)))
-            await is_heard()
-        await is_heard()  # while the door deals with their ends
+            await robot_is_received()
+        await robot_is_received()  # while the router handles their ends
     assert gate.command.out.count("ready") == 1

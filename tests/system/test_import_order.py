@@ -1,4 +1,4 @@
-"""The order of rooms is judged: by import-linter, and in strings by a lint of our own."""
+"""import-linter finds imports that break the order of the packages."""
 
 import os
 import shutil
@@ -14,15 +14,15 @@ SKIPPED = shutil.ignore_patterns("__pycache__", "*.js", "*.svg")
 
 
 @pytest.fixture
-def copy(tmp_path: Path) -> Path:
-    """A copy of the product's sources that a test may break."""
+def source_copy(tmp_path: Path) -> Path:
+    """Return a copy of the product's sources that a test may change."""
     for package in house.PACKAGES:
         shutil.copytree(house.ROOT / package, tmp_path / package, ignore=SKIPPED)
     shutil.copy(house.ROOT / "pyproject.toml", tmp_path)
     return tmp_path
 
 
-def imports_linted(root: Path) -> subprocess.CompletedProcess[str]:
+def lint_imports(root: Path) -> subprocess.CompletedProcess[str]:
     linter = Path(sys.executable).with_name("lint-imports")
     path = os.pathsep.join(str((root / package).parent) for package in house.PACKAGES)
     return subprocess.run(
@@ -31,7 +31,7 @@ def imports_linted(root: Path) -> subprocess.CompletedProcess[str]:
     )  # fmt: skip
 
 
-def add(path: Path, text: str) -> None:
+def append_text(path: Path, text: str) -> None:
     path.write_text(path.read_text("utf-8") + text, "utf-8")
 
 
@@ -52,11 +52,11 @@ def add(path: Path, text: str) -> None:
         ),
     ],
 )
-def test_an_import_against_the_order_is_found(
-    copy: Path, where: str, statement: str, contract: str
+def test_an_import_against_the_package_order_is_found(
+    source_copy: Path, where: str, statement: str, contract: str
 ) -> None:
-    assert imports_linted(copy).returncode == 0
-    add(copy / "gigabrain_zenoh" / where, f"\n{statement}\n")
-    done = imports_linted(copy)
+    assert lint_imports(source_copy).returncode == 0
+    append_text(source_copy / "gigabrain_zenoh" / where, f"\n{statement}\n")
+    done = lint_imports(source_copy)
     assert done.returncode == 1
     assert any(line.startswith(contract) and "BROKEN" in line for line in done.stdout.splitlines())

@@ -1,4 +1,4 @@
-"""An e-stop button: the contact opens, the adapter goes, the echo is wrong, the process dies."""
+"""An e-stop button: open contact, lost adapter, wrong echo, dead process."""
 
 import asyncio
 import itertools
@@ -24,78 +24,78 @@ from gigabrain_zenoh.launch.specs import process_specs
 from gigabrain_zenoh.testing.in_memory import Net, RobotInMemory
 
 MS = 1_000_000
-OPEN = "the contact is open, or its wire is broken"
-WRONG = "other bytes come back than were sent"
+OPEN_TEXT = "the contact is open, or its wire is broken"
+WRONG_TEXT = "other bytes come back than were sent"
 
 
 def counting() -> Callable[[int], bytes]:
-    """Bytes that count up, in place of random ones."""
+    """Return a source of bytes that count up, in place of random ones."""
     numbers = itertools.count()
     return lambda size: bytes(next(numbers) % 256 for _ in range(size))
 
 
 def closed(loop: EchoLoop, begin_ms: int, end_ms: int) -> None:
-    """The contact is closed for a while."""
-    for now in range(begin_ms, end_ms, 20):
-        loop.check_echo(loop.next_bytes(now * MS), (now + 5) * MS)
+    """Let the contact be closed from `begin_ms` to `end_ms`."""
+    for now_ms in range(begin_ms, end_ms, 20):
+        loop.check_echo(loop.next_bytes(now_ms * MS), (now_ms + 5) * MS)
 
 
-def test_a_closed_contact_gives_back_what_was_sent() -> None:
+def test_a_closed_contact_echoes_the_sent_bytes() -> None:
     loop = EchoLoop(counting())
-    assert loop.problem(0) == OPEN
+    assert loop.problem(0) == OPEN_TEXT
     closed(loop, 0, 100)
     assert loop.problem(100 * MS) == ""
 
 
-def test_an_open_contact_is_noticed_after_200_ms_and_not_before() -> None:
+def test_an_open_contact_is_reported_after_200_ms() -> None:
     loop = EchoLoop(counting())
-    closed(loop, 0, 100)  # the last question left at 80 ms
+    closed(loop, 0, 100)  # the last bytes left at 80 ms
     for now in range(100, 281, 20):
         loop.next_bytes(now * MS)
     assert loop.problem(280 * MS) == ""
-    assert loop.problem(281 * MS) == OPEN
+    assert loop.problem(281 * MS) == OPEN_TEXT
 
 
-def test_an_echo_that_comes_late_does_not_count() -> None:
+def test_a_late_echo_does_not_count() -> None:
     loop = EchoLoop(counting())
     loop.check_echo(loop.next_bytes(0), 201 * MS)
-    assert loop.problem(201 * MS) == OPEN
+    assert loop.problem(201 * MS) == OPEN_TEXT
 
 
-def test_a_wrong_byte_counts_as_pressed_and_200_ms_must_pass_before_anything_is_believed() -> None:
+def test_a_wrong_byte_counts_as_pressed_for_at_least_200_ms() -> None:
     loop = EchoLoop(counting())
     closed(loop, 0, 100)
     data = loop.next_bytes(100 * MS)
     loop.check_echo(bytes([data[0] ^ 1, data[1]]), 105 * MS)
-    assert loop.problem(105 * MS) == WRONG
+    assert loop.problem(105 * MS) == WRONG_TEXT
     assert loop.next_bytes(120 * MS) == b""
-    assert loop.problem(304 * MS) == WRONG
-    assert loop.problem(305 * MS) == OPEN
+    assert loop.problem(304 * MS) == WRONG_TEXT
+    assert loop.problem(305 * MS) == OPEN_TEXT
     closed(loop, 305, 330)
     assert loop.problem(330 * MS) == ""
 
 
-def test_bytes_that_nobody_sent_count_as_pressed() -> None:
+def test_unexpected_bytes_count_as_pressed() -> None:
     loop = EchoLoop(counting())
     closed(loop, 0, 100)
     loop.check_echo(b"\x00", 110 * MS)
-    assert loop.problem(110 * MS) == WRONG
+    assert loop.problem(110 * MS) == WRONG_TEXT
 
 
-def test_a_new_line_has_to_be_closed_anew() -> None:
+def test_a_reopened_port_counts_as_pressed_until_an_echo() -> None:
     loop = EchoLoop(counting())
     closed(loop, 0, 100)
     loop.opened()
-    assert loop.problem(100 * MS) == OPEN
+    assert loop.problem(100 * MS) == OPEN_TEXT
 
 
-def test_what_is_sent_cannot_be_guessed() -> None:
+def test_the_sent_bytes_are_random() -> None:
     loop = EchoLoop()
     assert len({loop.next_bytes(now) for now in range(100)}) > 90
 
 
 class Rig:
-    """A button on a pty whose contact the test moves, and a robot that may latch."""
+    """A button on a pty whose contact the test sets, and a fake driver that may latch."""
 
     def __init__(self, folder: Path) -> None:
         network, clock = LocalNetwork(), Clock()
@@ -127,8 +127,8 @@ class Rig:
             while not condition():  # noqa: ASYNC110
                 await asyncio.sleep(0.005)
 
-    async def says(self, text: str) -> None:
-        """Wait until it says this, and that it is pressed where there is a text."""
+    async def wait_for_text(self, text: str) -> None:
+        """Wait until the button reports this text, and is pressed unless the text is empty."""
         await self.until(lambda: self.check_echo and text in self.check_echo[-1].text)
         await self.until(lambda: self.check_echo[-1].pressed == bool(text))
 
@@ -144,16 +144,18 @@ async def rig(tmp_path: Path) -> AsyncIterator[Rig]:
     rig.pty.unplug()
 
 
-async def test_an_open_contact_stops_the_robot_and_a_closed_one_only_permits(rig: Rig) -> None:
+async def test_an_open_contact_requests_an_estop_and_a_closed_one_releases_nothing(
+    rig: Rig,
+) -> None:
     rig.closed = False
-    await rig.says(OPEN)
+    await rig.wait_for_text(OPEN_TEXT)
     await rig.until(lambda: rig.asked)
-    assert (rig.asked[0].source, rig.asked[0].reason) == ("button", OPEN)
+    assert (rig.asked[0].source, rig.asked[0].reason) == ("button", OPEN_TEXT)
     rig.closed = True
     await rig.until(lambda: not rig.check_echo[-1].pressed)
 
 
-async def test_an_error_in_what_presses_ends_the_process_and_lets_go_of_the_port(
+async def test_an_error_during_the_estop_request_ends_the_process_and_frees_the_port(
     rig: Rig, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     async def broken(*_: object) -> None:
@@ -167,14 +169,14 @@ async def test_an_error_in_what_presses_ends_the_process_and_lets_go_of_the_port
     assert not rig.button._link.connected
 
 
-async def test_it_asks_until_somebody_confirms(rig: Rig) -> None:
+async def test_the_estop_request_is_repeated_until_the_driver_latches(rig: Rig) -> None:
     rig.latches = rig.closed = False
     await rig.until(lambda: len(rig.asked) > 3)
     rig.latches = True
-    await rig.says(OPEN)
+    await rig.wait_for_text(OPEN_TEXT)
 
 
-async def test_an_unplugged_adapter_is_a_press(rig: Rig) -> None:
+async def test_an_unplugged_adapter_counts_as_pressed(rig: Rig) -> None:
     rig.pty.unplug()
     await rig.until(lambda: rig.check_echo[-1].pressed)
     await rig.until(lambda: rig.asked)
@@ -182,13 +184,13 @@ async def test_an_unplugged_adapter_is_a_press(rig: Rig) -> None:
     await rig.until(lambda: not rig.check_echo[-1].pressed)
 
 
-async def test_something_else_on_the_line_is_a_press(rig: Rig) -> None:
+async def test_foreign_bytes_on_the_line_count_as_pressed(rig: Rig) -> None:
     rig.pty.write(b"Linux login:")
-    await rig.says(WRONG)
+    await rig.wait_for_text(WRONG_TEXT)
     await rig.until(lambda: rig.asked)
 
 
-async def test_the_driver_takes_silence_for_a_latching_cause_once_it_was_heard() -> None:
+async def test_silence_of_a_button_seen_before_is_a_latching_cause() -> None:
     net, pressed = Net(), list[str]()
     watch = ButtonWatch(net.one, pressed.append)
     assert [(c.code, c.latching) for c in watch.faults()] == [("button_lost", False)]
@@ -204,10 +206,10 @@ async def test_the_driver_takes_silence_for_a_latching_cause_once_it_was_heard()
     assert pressed == ["the contact is open"]
 
 
-async def test_a_robot_with_a_button_does_not_move_without_its_word(tmp_path: Path) -> None:
+async def test_a_robot_with_a_button_moves_only_while_the_button_publishes(tmp_path: Path) -> None:
     async with RobotInMemory(tmp_path, button=True) as robot:
 
-        async def tell(ticks: int, pressed: bool) -> list[float]:
+        async def publish_button(ticks: int, pressed: bool) -> list[float]:
             speeds: list[float] = []
             for _ in range(ticks // 2):
                 robot.operator.publish(BUTTON, ButtonState(pressed=pressed))
@@ -216,9 +218,9 @@ async def test_a_robot_with_a_button_does_not_move_without_its_word(tmp_path: Pa
 
         assert set(await robot.go(100)) == {0.0}
         assert robot.causes == ["boot", "button_lost"]
-        assert (await tell(200, False))[-1] == pytest.approx(0.26)
-        told = await robot.go(30)
-        assert told[-1] == 0.0
+        assert (await publish_button(200, False))[-1] == pytest.approx(0.26)
+        speeds = await robot.go(30)
+        assert speeds[-1] == 0.0
         assert (robot.mode, "button_lost" in robot.causes) == ("latched", True)
 
 

@@ -19,7 +19,7 @@ asyncio.run(quiet())
 """
 
 
-def test_a_closed_pipe_on_stdout_is_noticed_at_once() -> None:
+def test_a_closed_stdout_pipe_ends_the_wait_at_once() -> None:
     read, write = os.pipe()
     with subprocess.Popen(
         [sys.executable, "-c", QUIET.format(patience_s=60)], stdout=write
@@ -31,7 +31,7 @@ def test_a_closed_pipe_on_stdout_is_noticed_at_once() -> None:
 
 
 @pytest.mark.parametrize("kind", ["pipe", "file"])
-def test_an_open_stdout_is_left_alone(kind: str, tmp_path: Path) -> None:
+def test_an_open_stdout_does_not_end_the_wait(kind: str, tmp_path: Path) -> None:
     with (tmp_path / "out").open("wb") as file:
         command = subprocess.run(
             [sys.executable, "-c", QUIET.format(patience_s=0.3)],

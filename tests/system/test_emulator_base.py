@@ -1,4 +1,4 @@
-"""The base of the emulators: ptys that can be unplugged, faults, stations, and their process."""
+"""The common base of the emulators: unpluggable ptys, faults, stations, and their process."""
 
 import asyncio
 import os
@@ -19,7 +19,7 @@ from gigabrain_zenoh.testing.waiting import until
 
 
 class Collector:
-    """A wire, or a port, that remembers what was written."""
+    """A wire or port that records what was written."""
 
     def __init__(self) -> None:
         self.pieces: list[bytes] = []
@@ -38,7 +38,7 @@ class Collector:
 
 
 class Echo(Device):
-    """Says back what it hears, and `.` each step."""
+    """A device that echoes its input, and writes `.` at each step."""
 
     period_s = 0.005
 
@@ -52,7 +52,7 @@ class Echo(Device):
         self.wire.write(b"ready")
 
 
-def test_faults_do_to_the_bytes_what_they_say() -> None:
+def test_each_fault_changes_the_bytes_as_named() -> None:
     out = Collector()
     wire = FaultyWire(out, seed=1)
     wire.faults = Faults(silence=True)
@@ -71,7 +71,7 @@ def test_faults_do_to_the_bytes_what_they_say() -> None:
     assert len(out.pieces[-1]) > 5
 
 
-def test_bytes_pile_up_while_a_line_hangs() -> None:
+def test_bytes_queue_up_while_a_line_is_frozen() -> None:
     wire = FaultyWire(Collector())
     wire.faults = Faults(frozen=True)
     assert wire.incoming(b"a") == wire.incoming(b"b") == b""
@@ -79,7 +79,7 @@ def test_bytes_pile_up_while_a_line_hangs() -> None:
     assert wire.incoming(b"c") == b"abc"
 
 
-def test_of_a_thousand_bytes_about_so_many_have_one_flipped_bit() -> None:
+def test_the_bit_error_rate_flips_one_bit_in_that_share_of_bytes() -> None:
     wire = FaultyWire(Collector(), seed=1)
     wire.faults = Faults(bit_errors=0.05)
     noisy = wire.incoming(bytes(10_000))
@@ -115,7 +115,7 @@ async def test_a_station_runs_its_device_with_its_faults() -> None:
     assert not port.plugged
 
 
-def test_faults_are_strict() -> None:
+def test_unknown_and_invalid_faults_are_refused() -> None:
     with pytest.raises(msgspec.ValidationError):
         msgspec.json.decode(b'{"silense": true}', type=Faults)
     with pytest.raises(msgspec.ValidationError):
@@ -123,16 +123,16 @@ def test_faults_are_strict() -> None:
 
 
 @pytest.mark.parametrize("driver", sorted(shipped_emulators()))
-def test_every_device_of_the_table_is_a_device(driver: str) -> None:
+def test_every_listed_emulator_is_a_device(driver: str) -> None:
     assert issubclass(device_class(driver), Device)
 
 
-def test_a_driver_without_a_device_says_which_have_one() -> None:
+def test_a_driver_without_an_emulator_is_refused_with_a_suggestion() -> None:
     with pytest.raises(UnknownName, match="no emulator for driver 'lime'; did you mean 'line'"):
         device_class("lime")
 
 
-async def test_gigabrain_emulate_is_a_body_until_it_is_told_to_end(tmp_path: Path) -> None:
+async def test_gigabrain_emulate_serves_its_ports_until_it_is_terminated(tmp_path: Path) -> None:
     command = [
         sys.executable, "-c", "from gigabrain_zenoh.cli.app import main; main()",
         "emulate", "mycustombot", "--ports", str(tmp_path),
@@ -157,7 +157,7 @@ async def test_gigabrain_emulate_is_a_body_until_it_is_told_to_end(tmp_path: Pat
             assert b"no fault 'nonsense'" in await process.stdout.readline()
             assert await process.stdout.readline() == b"faults now: base unplugged\n"
             assert not (tmp_path / "base").is_symlink()
-            process.terminate()  # not only Ctrl-C takes the ports away
+            process.terminate()  # SIGTERM also removes the ports
             assert await process.wait() == 0
         assert not (tmp_path / "scan").is_symlink()
     finally:

@@ -1,4 +1,4 @@
-"""A link never stops reconnecting, whatever exception comes from its port or its owner."""
+"""A link never stops reconnecting, whatever exception its port or its owner raises."""
 
 import asyncio
 import os
@@ -17,11 +17,11 @@ from gigabrain_drivers.links.serial_link import SerialLink
 from gigabrain_drivers.links.tcp_link import TcpLink
 from gigabrain_zenoh.clock import Clock
 from gigabrain_zenoh.testing.waiting import until
-from tests.system.links import Heard
+from tests.system.links import LinkRecorder
 
 
-class Flaky(Link):
-    """Its port raises these, one try after the other, and then is good: a pipe."""
+class FlakyLink(Link):
+    """A link whose port raises the given faults, one per try, and then is a pipe."""
 
     def __init__(self, *faults: Exception) -> None:
         super().__init__(Clock())
@@ -63,18 +63,18 @@ class Flaky(Link):
 async def test_a_port_that_raises_anything_is_tried_again(
     fault: Exception, caplog: pytest.LogCaptureFixture
 ) -> None:
-    link = Flaky(fault, fault)
+    link = FlakyLink(fault, fault)
     link.open()
     await until(lambda: link.connected)
     await link.close()
-    told = [record for record in caplog.records if record.levelname == "ERROR"]
+    errors = [record for record in caplog.records if record.levelname == "ERROR"]
     expected = not isinstance(fault, (LinkProblem, OSError))
-    assert len(told) == expected  # once, with where it came from
-    assert all(record.exc_info for record in told)
+    assert len(errors) == expected  # once, with its traceback
+    assert all(record.exc_info for record in errors)
 
 
-async def test_an_owner_that_raises_when_it_opens_gets_another_connection() -> None:
-    link, opened = Flaky(), list[int]()
+async def test_an_exception_in_on_open_causes_a_reconnection() -> None:
+    link, opened = FlakyLink(), list[int]()
 
     def on_open() -> None:
         opened.append(len(opened))
@@ -88,10 +88,10 @@ async def test_an_owner_that_raises_when_it_opens_gets_another_connection() -> N
     await link.close()
 
 
-async def test_a_connection_that_cannot_be_watched_is_made_again(
+async def test_a_connection_that_cannot_be_polled_is_made_again(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    link, loop, add = Flaky(), asyncio.get_running_loop(), asyncio.get_running_loop().add_reader
+    link, loop, add = FlakyLink(), asyncio.get_running_loop(), asyncio.get_running_loop().add_reader
     faults = [PermissionError(1, "epoll_ctl"), ValueError("no descriptor")]
 
     def watched(*args: Any) -> None:
@@ -106,10 +106,10 @@ async def test_a_connection_that_cannot_be_watched_is_made_again(
 
 
 @pytest.mark.parametrize("gather_s", [0.0, 0.001])
-async def test_an_owner_that_chokes_on_bytes_gets_those_of_another_connection(
+async def test_an_exception_in_on_bytes_causes_a_reconnection(
     gather_s: float,
 ) -> None:
-    link, received = Flaky(), list[bytes]()
+    link, received = FlakyLink(), list[bytes]()
     link.gather_s = gather_s
 
     def on_bytes(data: bytes) -> None:
@@ -128,8 +128,8 @@ async def test_an_owner_that_chokes_on_bytes_gets_those_of_another_connection(
     await link.close()
 
 
-async def test_an_owner_that_raises_at_the_loss_does_not_end_the_link() -> None:
-    link = Flaky()
+async def test_an_exception_in_on_lost_does_not_end_the_link() -> None:
+    link = FlakyLink()
 
     def on_lost(_: str) -> None:
         raise ValueError("lost")
@@ -151,7 +151,7 @@ async def pty(tmp_path: Path) -> AsyncIterator[Pty]:
     port.unplug()
 
 
-async def test_an_adapter_that_bounces_between_open_and_its_settings_is_opened_again(
+async def test_an_adapter_lost_between_open_and_settings_is_opened_again(
     pty: Pty, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     opened, bounced = list[serial.Serial](), list[int]()
@@ -170,17 +170,17 @@ async def test_an_adapter_that_bounces_between_open_and_its_settings_is_opened_a
     monkeypatch.setattr(serial_link, "open_port", opening)
     monkeypatch.setattr(termios, "tcgetattr", bouncing)
     link = SerialLink(str(pty.path), 115200, Clock())
-    received = Heard(link)
+    received = LinkRecorder(link)
     link.open()
     await until(lambda: link.connected)
     assert bounced
-    assert not opened[0].is_open  # nothing leaks
+    assert not opened[0].is_open  # not leaked
     pty.write(b"hello")
     await until(lambda: received.data == b"hello")
     await link.close()
 
 
-async def test_a_probe_that_fails_leaves_no_port_open(
+async def test_a_failing_probe_leaves_no_port_open(
     pty: Pty, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     probed: list[serial.Serial] = []
@@ -199,7 +199,7 @@ async def test_a_probe_that_fails_leaves_no_port_open(
     await link.close()
 
 
-async def test_a_host_name_that_can_be_none_is_a_problem_and_not_an_end() -> None:
+async def test_an_invalid_host_name_is_a_problem_and_does_not_end_the_link() -> None:
     link = TcpLink("a..b", 80, Clock())
     link.open()
     await until(lambda: "a..b" in link.problem)
