@@ -24,7 +24,7 @@ from gigabrain_zenoh.manipulation.arm_planner import ArmPlanner
 from gigabrain_zenoh.qa.bench.hands import ArmInMemory
 from gigabrain_zenoh.testing.waiting import PATIENCE_S
 
-CUBE = """<mujoco><worldbody>
+CUBE_WORLD = """<mujoco><worldbody>
   <geom name="floor" type="plane" size="2 2 .1"/>
   <body name="thing" pos="{x} {y} 0.015"><freejoint/>
     <geom type="box" size=".015 .015 .015" mass=".05" condim="6" friction="1 .02 .0005"/>
@@ -51,7 +51,7 @@ class Rig:
         body: str = "so101",
         world: Path | None = None,
     ) -> None:
-        (folder / "thing.xml").write_text(CUBE.format(x=cube[0], y=cube[1]))
+        (folder / "thing.xml").write_text(CUBE_WORLD.format(x=cube[0], y=cube[1]))
         (folder / "world.yaml").write_text("model: thing.xml\nstart: [0.0, 0.0, 0.0]\n")
         robot, _, options, model_folder = load_link(body, Run(folder=Path()))
         assert isinstance(options, MujocoOptions)

@@ -33,7 +33,7 @@ BOXES = (
 )
 FOLDER = robot_path("so101").parent
 MJCF = (FOLDER / "model.xml").read_text()
-REST = 0.05  # [rad/s]
+REST_SPEED_RAD_S = 0.05  # [rad/s]
 
 
 class Truth:
@@ -180,7 +180,9 @@ def rests_for(rig: Rig, code: str, posture: tuple[float, ...]) -> bool:
     """Command a posture for one tick, and return whether the arm rests for this cause."""
     rig.tick(position=posture)
     causes = rig.gate.safety.causes if rig.gate.safety else ()
-    return code in [cause.code for cause in causes] and bool(np.abs(rig.speeds).max() < REST)
+    return code in [cause.code for cause in causes] and bool(
+        np.abs(rig.speeds).max() < REST_SPEED_RAD_S
+    )
 
 
 @pytest.mark.parametrize(
@@ -239,7 +241,7 @@ def test_an_estop_or_a_dead_process_holds_a_moving_arm(
     for _ in range(75):
         rig.tick()
     held = rig.posture
-    assert np.abs(rig.speeds).max() < REST
+    assert np.abs(rig.speeds).max() < REST_SPEED_RAD_S
     for _ in range(100):
         rig.tick()
     assert [joint.position for joint in rig.gate.joints] == sent

@@ -62,13 +62,13 @@ from tests.node.plane import ROOM, Plane, drawn
 from tests.unit.recording import bags
 
 RECORDINGS = Path(__file__).parents[1] / "recordings"
-RENEW = "was the change meant? then: make recordings"
+RENEW_HINT = "was the change meant? then: make recordings"
 
 
 # matching scans amplifies the last digits, in which processors differ, to 0.7 mm and 0.15 degrees
-LONG = {("exploring", "perception")}
+VARYING = {("exploring", "perception")}
 REPLAYS = [
-    pytest.param(name, process, marks=pytest.mark.qa if (name, process) in LONG else ())
+    pytest.param(name, process, marks=pytest.mark.qa if (name, process) in VARYING else ())
     for name in DRIVES
     for process in OUTPUTS
 ]
@@ -78,7 +78,7 @@ REPLAYS = [
 async def test_every_process_behaves_as_on_the_recorded_drive(name: str, process: str) -> None:
     path = file_of(RECORDINGS, name)
     outcome = await replay_process(path, process, settings_for(path, process, None), node_of)
-    assert outcome.same, (outcome, RENEW)
+    assert outcome.same, (outcome, RENEW_HINT)
     assert outcome.compared > 30
     assert not outcome.begun_late
 

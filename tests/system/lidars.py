@@ -78,14 +78,14 @@ class Listener:
     async def __aexit__(self, *_: object) -> None:
         await self.source.close()
 
-    async def more(self, count: int) -> list[LaserScan]:
+    async def next_scans(self, count: int) -> list[LaserScan]:
         """Wait for the next `count` scans and return them."""
         start = len(self.scans)
         await until(lambda: len(self.scans) >= start + count)
         return self.scans[start : start + count]
 
 
-def agree(scan: LaserScan, expected: NDArray[np.float32], within: float = 0.06) -> float:
+def agreement(scan: LaserScan, expected: NDArray[np.float32], within: float = 0.06) -> float:
     """Return the share of beams that agree with the expected beam or one of its neighbours."""
     got, seen = (
         np.nan_to_num(values, nan=-1.0, posinf=99.0) for values in (scan.ranges_m, expected)

@@ -14,7 +14,7 @@ from gigabrain_schemas.sensors import LaserScan
 from gigabrain_schemas.topics import SCAN
 from gigabrain_zenoh.errors import ConfigError, UnknownName
 from gigabrain_zenoh.testing.waiting import until
-from tests.system.lidars import agree, emulated, truth
+from tests.system.lidars import agreement, emulated, truth
 
 BODY = """\
 summary: a body in memory that carries a lidar
@@ -44,7 +44,7 @@ async def test_a_body_emits_the_scans_of_its_lidar(tmp_path: Path) -> None:
 
     assert newest in scans
     assert isinstance(newest, LaserScan)
-    assert agree(newest, truth()) > 0.97
+    assert agreement(newest, truth()) > 0.97
 
 
 async def test_a_body_opens_and_closes_without_its_lidar(tmp_path: Path) -> None:

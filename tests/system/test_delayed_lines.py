@@ -31,7 +31,7 @@ async def test_scans_of_an_ld19_report_the_delay_of_its_line(tmp_path: Path) -> 
         LineProxy(device.port, Path(behind.port)) as proxy,
         Listener(Ld19(behind, LIDAR, Clock())) as listener,
     ):
-        await listener.more(5)
+        await listener.next_scans(5)
         await until(lambda: listener.scans[-1].late_ms < 40.0)
         proxy.set(Chaos(delay_ms=100.0))
         await until(lambda: listener.scans[-1].late_ms >= 70.0)

@@ -11,7 +11,7 @@ from gigabrain_drivers.lidars.base import source_class
 from gigabrain_schemas.sensors import LaserScan
 from gigabrain_zenoh.errors import ConfigError, UnknownName
 from gigabrain_zenoh.testing.waiting import until
-from tests.system.lidars import agree, emulated, truth
+from tests.system.lidars import agreement, emulated, truth
 
 NAME = "foreign_lidar"
 SOURCE = '''"""A lidar on a serial line, and the lidar itself."""
@@ -77,7 +77,7 @@ async def test_a_body_can_use_a_packaged_lidar(tmp_path: Path) -> None:
     driver.emit = lambda _, message: scans.append(message)  # type: ignore[arg-type]
     async with emulated(device_class(NAME), driver.options.scan), driver:
         await until(lambda: len(scans) >= 2)
-    assert agree(scans[-1], truth()) > 0.97
+    assert agreement(scans[-1], truth()) > 0.97
 
 
 def test_the_name_of_a_packaged_lidar_is_suggested_if_misspelt() -> None:

@@ -62,7 +62,7 @@ STANDING = RobotState(
     gate=GateStatus(mode="enabled", commander="control"),
 )
 LINKS = ("base", "shoulder", "upper_arm", "lower_arm", "wrist", "gripper", "jaw")
-LEFT = {"linear": {"x": 0, "y": 0, "z": 0}, "angular": {"x": 0, "y": 0, "z": 0.5}}
+TURN_LEFT = {"linear": {"x": 0, "y": 0, "z": 0}, "angular": {"x": 0, "y": 0, "z": 0.5}}
 
 
 @pytest.fixture
@@ -116,7 +116,7 @@ async def test_every_kind_of_message_has_a_channel(bridge: Bridge) -> None:
 async def steering(bridge: Bridge, viewer: Viewer) -> None:
     """Make the viewer one that has the layout with the secret."""
     await viewer.publish_on(topic_to_steer(bridge.config))
-    await hold(viewer, LEFT, lambda: bridge.steered)
+    await hold(viewer, TURN_LEFT, lambda: bridge.steered)
 
 
 async def test_only_viewers_with_the_layout_can_call_services(bridge: Bridge) -> None:
@@ -357,7 +357,7 @@ async def test_a_viewer_steers_a_robot_and_a_second_bridge_is_refused(
                 # on a busy machine the gate may stop the robot, which a held button does not move
                 while not turns():
                     with contextlib.suppress(TimeoutError):
-                        await hold(viewer, LEFT, turns, 2.0)
+                        await hold(viewer, TURN_LEFT, turns, 2.0)
                         break
                     await asyncio.sleep(1.0)  # the button is released
         await seen.at_rest()

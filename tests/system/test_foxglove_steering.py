@@ -19,7 +19,7 @@ from gigabrain_zenoh.ui.foxglove.access import topic_to_steer
 from gigabrain_zenoh.ui.foxglove.node import velocity_of
 from tests.system.foxglove_bridge import Bridge, bridged, hold
 
-LEFT = {"linear": {"x": 0, "y": 0, "z": 0}, "angular": {"x": 0, "y": 0, "z": 0.5}}
+TURN_LEFT = {"linear": {"x": 0, "y": 0, "z": 0}, "angular": {"x": 0, "y": 0, "z": 0.5}}
 
 
 @pytest.fixture
@@ -32,7 +32,7 @@ async def test_the_teleop_panel_steers_and_a_lost_viewer_stops_the_robot(bridge:
     topic = topic_to_steer(bridge.config)
     async with bridge.viewer() as viewer:
         await viewer.publish_on(topic)
-        await hold(viewer, LEFT, lambda: bridge.turns)
+        await hold(viewer, TURN_LEFT, lambda: bridge.turns)
         assert bridge.turns[-1] == 0.5
         await hold(viewer, {"linear_x": 9.0}, lambda: bridge.steered[-1].linear_x)
         assert bridge.steered[-1].linear_x == 0.26  # limited to the speed of the body
@@ -44,10 +44,10 @@ async def test_only_one_of_two_viewers_steers(bridge: Bridge) -> None:
     async with bridge.viewer() as one, bridge.viewer() as two:
         for viewer in (one, two):
             await viewer.publish_on(topic)
-        await hold(one, LEFT, lambda: bridge.turns)
+        await hold(one, TURN_LEFT, lambda: bridge.turns)
         for _ in range(5):
             await two.publish({"angular_z": -0.5})
-            await hold(one, LEFT, lambda: True)
+            await hold(one, TURN_LEFT, lambda: True)
         await hold(one, {"angular_z": 0.25}, lambda: bridge.turns[-1] == 0.25)
     assert -0.5 not in bridge.turns
 
@@ -63,7 +63,7 @@ async def test_an_invalid_velocity_does_not_steer(bridge: Bridge, content: objec
     async with bridge.viewer() as viewer:
         await viewer.publish_on(topic_to_steer(bridge.config))
         await viewer.publish(content)
-        await hold(viewer, LEFT, lambda: bridge.turns)
+        await hold(viewer, TURN_LEFT, lambda: bridge.turns)
     assert {twist.linear_x for twist in bridge.steered} == {0.0}
 
 
@@ -75,7 +75,7 @@ async def test_a_viewer_without_the_secret_topic_cannot_steer(bridge: Bridge, to
         for _ in range(10):
             await stranger.publish({"angular_z": -0.5})
             await asyncio.sleep(0.02)
-        await hold(owner, LEFT, lambda: bridge.turns)
+        await hold(owner, TURN_LEFT, lambda: bridge.turns)
     assert -0.5 not in bridge.turns
 
 
@@ -90,7 +90,7 @@ async def test_every_refused_viewer_is_logged_once_however_many_there_are(
         async with bridge.viewer() as stranger:
             for topic in ("/teleop", "/cmd_vel"):
                 await stranger.publish_on(topic)
-            await until(lambda: refusals() == number, "a refusal in the log")
+            await until(lambda n=number: refusals() == n, "a refusal in the log")
             await asyncio.sleep(0.05)
         assert refusals() == number
 
@@ -117,7 +117,7 @@ async def test_noise_floods_and_lost_viewers_do_not_disturb_others(bridge: Bridg
 
 
 def test_velocities_in_the_format_of_the_panel_and_in_ours_are_read() -> None:
-    assert velocity_of(json.dumps(LEFT).encode()).angular_z == 0.5
+    assert velocity_of(json.dumps(TURN_LEFT).encode()).angular_z == 0.5
     assert velocity_of(b'{"linear_x": 0.2, "linear_y": 0.1}').linear_y == 0.1
     with pytest.raises(ValueError, match="moves in x and y"):
         velocity_of(b'{"linear": {"z": 1}, "angular": {}}')

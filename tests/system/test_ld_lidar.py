@@ -15,7 +15,7 @@ from gigabrain_drivers.lidars.ld.source import Ld19
 from gigabrain_schemas.body import Lidar
 from gigabrain_zenoh.clock import Clock, FakeClock
 from gigabrain_zenoh.testing.waiting import until
-from tests.system.lidars import LIDAR, Listener, Wire, agree, emulated, run_for, truth, waffle
+from tests.system.lidars import LIDAR, Listener, Wire, agreement, emulated, run_for, truth, waffle
 
 SMALL = Lidar(beams=8, rate_hz=10, range_min=0.1, range_max=3.0)
 MS = 1_000_000
@@ -111,7 +111,7 @@ def test_a_scan_of_the_emulated_lidar_is_the_scan_of_the_simulation() -> None:
         wire.sent.clear()
 
     assert len(scans) == 3  # the first and the last turn are incomplete
-    assert agree(scans[-1], truth()) > 0.97
+    assert agreement(scans[-1], truth()) > 0.97
     assert not np.isnan(scans[-1].ranges_m).any()
 
 
@@ -120,8 +120,8 @@ async def test_scans_arrive_over_a_pty_and_again_after_it_was_unplugged(tmp_path
         emulated(LdDevice, options(tmp_path)) as station,
         Listener(Ld19(options(tmp_path), LIDAR, Clock())) as listener,
     ):
-        scan = (await listener.more(3))[-1]
-        assert agree(scan, truth()) > 0.97
+        scan = (await listener.next_scans(3))[-1]
+        assert agreement(scan, truth()) > 0.97
         assert listener.source.health.connected
         assert listener.source.health.errors == 0
 
@@ -131,7 +131,7 @@ async def test_scans_arrive_over_a_pty_and_again_after_it_was_unplugged(tmp_path
         assert not listener.source.health.connected
 
         station.set(NO_FAULTS)
-        await listener.more(2)
+        await listener.next_scans(2)
         assert listener.source.health.reconnects >= 1
         await until(lambda: not listener.source.problem)
 
@@ -141,11 +141,11 @@ async def test_silence_is_reported_in_one_line_until_data_returns(tmp_path: Path
         emulated(LdDevice, options(tmp_path)) as station,
         Listener(Ld19(options(tmp_path), LIDAR, Clock())) as listener,
     ):
-        await listener.more(1)
+        await listener.next_scans(1)
         station.set(Faults(silence=True))
         await until(lambda: listener.source.problem)
         station.set(NO_FAULTS)
-        await listener.more(1)
+        await listener.next_scans(1)
 
 
 async def test_bit_errors_and_half_frames_only_lose_frames(tmp_path: Path) -> None:
@@ -153,15 +153,15 @@ async def test_bit_errors_and_half_frames_only_lose_frames(tmp_path: Path) -> No
         emulated(LdDevice, options(tmp_path)) as station,
         Listener(Ld19(options(tmp_path), LIDAR, Clock())) as listener,
     ):
-        await listener.more(1)
+        await listener.next_scans(1)
         station.set(Faults(bit_errors=0.001, half_frames=0.01, garbage=0.01))
-        scans = await listener.more(10)
+        scans = await listener.next_scans(10)
         real = truth()
 
         assert listener.source.health.errors > 5
         for scan in scans:
             missing = np.isnan(scan.ranges_m).sum()
-            assert agree(scan, real) > 0.97 - missing / 360
+            assert agreement(scan, real) > 0.97 - missing / 360
 
 
 async def test_a_missing_ld19_is_reported_as_silent(tmp_path: Path) -> None:

@@ -21,7 +21,7 @@ from gigabrain_schemas.body import Lidar
 from gigabrain_schemas.sensors import LaserScan
 from gigabrain_zenoh.clock import Clock, FakeClock
 from gigabrain_zenoh.testing.waiting import until
-from tests.system.lidars import LIDAR, Listener, Wire, agree, emulated, run_for, truth, waffle
+from tests.system.lidars import LIDAR, Listener, Wire, agreement, emulated, run_for, truth, waffle
 
 MS = 1_000_000
 COARSE = Lidar(beams=180, rate_hz=10, range_min=0.16, range_max=3.5)
@@ -128,7 +128,7 @@ def test_an_emulated_scan_is_the_simulations(
     scans = scans_of(source(options(), lidar, clock), clock, pieces)
     assert len(scans) >= 3
     expected = truth()[:: 360 // lidar.beams]
-    assert agree(scans[-1], expected, within=0.1) > 0.97
+    assert agreement(scans[-1], expected, within=0.1) > 0.97
     assert np.isnan(scans[-1].ranges_m).mean() < 0.03
 
 
@@ -140,14 +140,14 @@ async def test_scans_arrive_over_a_pty_and_again_after_it_was_unplugged(
         emulated(device, options(tmp_path)) as station,
         Listener(source(options(tmp_path), lidar, Clock())) as listener,
     ):
-        scan = (await listener.more(2))[-1]
+        scan = (await listener.next_scans(2))[-1]
         expected = truth()[:: 360 // lidar.beams]
-        assert agree(scan, expected, within=0.1) > 0.95
+        assert agreement(scan, expected, within=0.1) > 0.95
         assert listener.source.health.connected
         station.set(Faults(unplugged=True))
         await until(lambda: not listener.source.health.connected)
         station.set(NO_FAULTS)
-        await listener.more(2)
+        await listener.next_scans(2)
         assert listener.source.health.reconnects >= 1
 
 
@@ -159,11 +159,11 @@ async def test_noise_only_loses_frames(
         emulated(device, options(tmp_path)) as station,
         Listener(source(options(tmp_path), lidar, Clock())) as listener,
     ):
-        await listener.more(1)
+        await listener.next_scans(1)
         station.set(Faults(half_frames=0.02, garbage=0.02))
         await until(lambda: listener.source.health.errors > 3)
         station.set(NO_FAULTS)
-        await listener.more(2)
+        await listener.next_scans(2)
 
 
 @pytest.mark.parametrize(
@@ -176,14 +176,14 @@ async def test_a_lidar_that_was_rebooted_is_started_again(
         emulated(device, options(tmp_path)) as station,
         Listener(source(options(tmp_path), SLOW, Clock())) as listener,
     ):
-        await listener.more(1)
+        await listener.next_scans(1)
         station.device.reset()
-        await listener.more(2)
+        await listener.next_scans(2)
 
 
 async def test_closing_the_port_stops_the_lidar_motor(tmp_path: Path) -> None:
     async with emulated(Lds01Device, options(tmp_path)) as station:
         async with Listener(Lds01(options(tmp_path), SLOW, Clock())) as listener:
-            await listener.more(1)
+            await listener.next_scans(1)
         sweep = station.device._sweep  # type: ignore[attr-defined]
         await until(lambda: not sweep._rate_hz)

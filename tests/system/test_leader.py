@@ -27,7 +27,7 @@ from tests.unit.drivers.feetech import FreeArm
 JOINTS = load_robot("so101").joints
 NAMES = [joint.name for joint in JOINTS]
 TEN_MS = 0.01
-NEAR = 0.02  # [rad]
+TOLERANCE_RAD = 0.02  # [rad]
 
 
 @pytest.fixture(scope="module")
@@ -75,11 +75,11 @@ async def leader_at(port: Path) -> AsyncIterator[Leader]:
         yield Leader(device, body, port)
 
 
-async def reads(leader: LeaderArm, name: str, position: float) -> dict[str, float]:
+async def wait_for_position(leader: LeaderArm, name: str, position: float) -> dict[str, float]:
     """Wait until a joint reads `position` [rad]; return the posture then."""
     for _ in range(6000):
         found = dict(await leader.read())
-        if abs(found[name] - position) < NEAR:
+        if abs(found[name] - position) < TOLERANCE_RAD:
             return found
         await asyncio.sleep(TEN_MS)
     raise AssertionError(f"{name} is at {found[name]:.2f}")
@@ -118,9 +118,9 @@ async def test_an_arm_goes_slowly_to_the_posture_of_its_leader_then_follows_it(
         assert max_joint_speed(ways) < 1.3  # [rad/s]; 45 degrees are 0.79
         assert arm.state.gate.commander.endswith("-leader")
         await leader.move(shoulder_pan=-0.3, wrist_roll=0.5, gripper=0.5)
-        await until(lambda: abs(sent(arm, "shoulder_pan") + 0.3) < NEAR, "it follows")
-        await until(lambda: abs(sent(arm, "gripper") - 0.5) < NEAR, "its gripper as well")
-        await until(lambda: abs(arm.state.joints[0].position + 0.3) < 3 * NEAR, "measured")
+        await until(lambda: abs(sent(arm, "shoulder_pan") + 0.3) < TOLERANCE_RAD, "it follows")
+        await until(lambda: abs(sent(arm, "gripper") - 0.5) < TOLERANCE_RAD, "its gripper as well")
+        await until(lambda: abs(arm.state.joints[0].position + 0.3) < 3 * TOLERANCE_RAD, "measured")
         assert not any(servo[feetech.TORQUE] for servo in leader.device.servos.values())
         assert [servo.kept for servo in leader.device.servos.values()] == kept
         command.send(signal.SIGINT)
@@ -128,7 +128,7 @@ async def test_an_arm_goes_slowly_to_the_posture_of_its_leader_then_follows_it(
         assert command.out.endswith("so101 holds where it is\n")
     await until(lambda: arm.state.gate.commander == "control", "the brain goes on")
     await arm.ticks(25)
-    assert sent(arm, "shoulder_pan") == pytest.approx(-0.3, abs=NEAR)
+    assert sent(arm, "shoulder_pan") == pytest.approx(-0.3, abs=TOLERANCE_RAD)
     record.send(signal.SIGINT)
     assert await record.ended() == 0
     led = list(frames(bag))
@@ -230,8 +230,8 @@ async def test_the_limp_arm_of_the_emulator_is_moved_by_typed_commands(
         assert b"no joint 'elbow'" in await emulator.stdout.readline()
         async with LeaderArm(str(tmp_path / "base"), "emulated.yaml") as leader:
             assert leader.let_go
-            await reads(leader, "shoulder_pan", math.radians(30))
-            found = await reads(leader, "gripper", math.radians(50))
+            await wait_for_position(leader, "shoulder_pan", math.radians(30))
+            found = await wait_for_position(leader, "gripper", math.radians(50))
             home = dict(zip(NAMES, load_robot("so101").arm.home, strict=True))  # type: ignore[union-attr]
             assert found["elbow_flex"] == pytest.approx(home["elbow_flex"], abs=0.1)
     finally:

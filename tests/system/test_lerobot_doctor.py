@@ -20,7 +20,7 @@ pytestmark = pytest.mark.qa
 DOCTOR = "lerobot-doctor==0.2.0"
 
 
-def winding(states: int) -> Iterator[tuple[int, str, bytes]]:
+def winding_drive(states: int) -> Iterator[tuple[int, str, bytes]]:
     """Yield states, commands and scans of a drive in which all values change."""
     for seq in range(1, states + 1):
         seconds = seq / 50
@@ -43,7 +43,7 @@ def winding(states: int) -> Iterator[tuple[int, str, bytes]]:
 def test_lerobot_doctor_finds_no_fault_in_our_dataset(tmp_path: Path) -> None:
     path, folder = tmp_path / "a.mcap", tmp_path / "dataset"
     ticks = range(5, 1001, 5)
-    write(path, winding(1000), pictures(ticks), pictures(ticks, "robot/depth/front"))
+    write(path, winding_drive(1000), pictures(ticks), pictures(ticks, "robot/depth/front"))
     convert(path, folder)
     command = [sys.executable, "-m", "uv", "tool", "run", DOCTOR, "check", str(folder)]
     done = subprocess.run(command, capture_output=True, text=True, timeout=600, check=False)

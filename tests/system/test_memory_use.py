@@ -5,7 +5,7 @@ import sys
 
 import pytest
 
-MAPS = """
+MAPS_PROGRAM = """
 import sys, threading
 import numpy as np
 from gigabrain_zenoh.host import this_process as heap
@@ -35,7 +35,7 @@ for _ in range(3):
 print(held_mb() - before)
 """
 MAX_GROWTH_MB = 5.0
-PICTURES = """
+PICTURES_PROGRAM = """
 import resource, sys
 import numpy as np
 from gigabrain_zenoh.host import this_process as heap
@@ -59,7 +59,7 @@ print(resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before)
 def grown_mb(*words: str) -> float:
     """Return how much larger a process stays after large arrays in threads [MB]."""
     done = subprocess.run(
-        (sys.executable, "-c", MAPS, *words), capture_output=True, text=True, check=True
+        (sys.executable, "-c", MAPS_PROGRAM, *words), capture_output=True, text=True, check=True
     )
     return float(done.stdout)
 
@@ -72,12 +72,12 @@ def test_large_blocks_go_back_to_the_system() -> None:
 @pytest.mark.skipif(sys.platform != "linux", reason="glibc's heap")
 def test_memory_needed_for_each_picture_stays_in_the_heap() -> None:
     done = subprocess.run(
-        (sys.executable, "-c", PICTURES), capture_output=True, text=True, check=True
+        (sys.executable, "-c", PICTURES_PROGRAM), capture_output=True, text=True, check=True
     )
     assert int(done.stdout) < 1000
 
 
-CODE = """
+CODE_PROGRAM = """
 from gigabrain_zenoh.host import this_process
 from gigabrain_zenoh.mapping.slam_map import warm_up
 
@@ -102,7 +102,7 @@ print(before, code_kb())
 @pytest.mark.skipif(sys.platform != "linux", reason="Linux tells what is mapped")
 def test_code_used_only_at_the_start_is_unmapped() -> None:
     pytest.importorskip("gtsam")
-    done = subprocess.run((sys.executable, "-c", CODE), capture_output=True, text=True)
+    done = subprocess.run((sys.executable, "-c", CODE_PROGRAM), capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     before, after = map(int, done.stdout.split())
     assert after < before - 15_000

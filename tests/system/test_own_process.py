@@ -117,7 +117,7 @@ class Robot:
         await until(lambda: self.states and self.states[-1].gate.mode == "enabled", "it drives")
         self.states.clear()
 
-    def others(self, name: str) -> set[int]:
+    def other_pids(self, name: str) -> set[int]:
         """Return the pids of all processes but one."""
         return set(self.home.processes()) - set(self.home.processes(name))
 
@@ -161,7 +161,7 @@ async def start(tmp_path: Path) -> AsyncIterator[object]:
     async with asyncio.timeout(120):
         stack = []
 
-        async def begin(name: str) -> Robot:
+        async def start_robot(name: str) -> Robot:
             file = home.deployment(
                 body="mock",
                 router=router,
@@ -178,7 +178,7 @@ async def start(tmp_path: Path) -> AsyncIterator[object]:
             return robot
 
         try:
-            yield begin
+            yield start_robot
         finally:
             for session in stack:
                 await session.__aexit__(None, None, None)
@@ -190,7 +190,7 @@ async def test_a_process_that_raises_is_named_and_restarted_while_the_robot_driv
     name: str, start: object
 ) -> None:
     robot = await start(name)  # type: ignore[operator]
-    others, before = robot.others(name), robot.home.processes(name)
+    other_pids, before = robot.other_pids(name), robot.home.processes(name)
     robot.how.write_text("raise")
     await until(lambda: [one for one in robot.log if one.event == "died"], "it is heard on the bus")
     (died, *_) = [one for one in robot.log if one.event == "died"]
@@ -198,7 +198,7 @@ async def test_a_process_that_raises_is_named_and_restarted_while_the_robot_driv
     assert died.text == "died of ValueError: as asked, in bad_company.py:19"
     robot.how.unlink()
     await until(lambda: robot.home.processes(name) not in ([], before), "it is restarted")
-    assert robot.others(name) == others
+    assert robot.other_pids(name) == other_pids
     assert robot.stop_causes == set()
     await robot.wait_until_enabled()
 
@@ -209,7 +209,7 @@ async def test_a_process_that_hangs_is_killed_with_its_stack_while_the_robot_dri
     name: str, start: object
 ) -> None:
     robot = await start(name)  # type: ignore[operator]
-    others, before = robot.others(name), robot.home.processes(name)
+    other_pids, before = robot.other_pids(name), robot.home.processes(name)
     robot.how.write_text("hang")
     await until(lambda: f"{name} is silent" in robot.problems, "the router names it")
     await until(lambda: f"{name} has made no progress for 5 s" in robot.up.out, "it is killed")
@@ -217,7 +217,7 @@ async def test_a_process_that_hangs_is_killed_with_its_stack_while_the_robot_dri
     robot.how.unlink()
     await until(lambda: robot.home.processes(name) not in ([], before), "it is restarted")
     await until(lambda: not robot.problems, "it is well again")
-    assert robot.others(name) == others
+    assert robot.other_pids(name) == other_pids
     assert robot.stop_causes == set()
     await robot.wait_until_enabled()
     log = await robot.home.run("log", "--process", name)
@@ -243,7 +243,7 @@ async def test_a_failing_behaviour_stops_the_robot_but_no_other_process(
     how: str, start: object
 ) -> None:
     robot = await start("decision")  # type: ignore[operator]
-    others, before = robot.others("decision"), robot.home.processes("decision")
+    other_pids, before = robot.other_pids("decision"), robot.home.processes("decision")
     robot.how.write_text(how)
     await until(lambda: robot.states and not robot.moves, "it stands")
     named = "(behaviour 'bad')" if how == "raise" else 'bad_company.py", line'
@@ -251,4 +251,4 @@ async def test_a_failing_behaviour_stops_the_robot_but_no_other_process(
     robot.how.unlink()
     await until(lambda: robot.home.processes("decision") not in ([], before), "it is restarted")
     await until(lambda: robot.moves, "it drives again")
-    assert robot.others("decision") == others
+    assert robot.other_pids("decision") == other_pids

@@ -11,7 +11,7 @@ from gigabrain_zenoh.recording.bag_reader import faults, read_info
 from gigabrain_zenoh.testing.processes import Home, endpoint_of
 from gigabrain_zenoh.testing.waiting import until
 
-ALL = ["router", "driver", "perception", "decision", "control", "safety", "recorder"]
+ALL_PROCESSES = ["router", "driver", "perception", "decision", "control", "safety", "recorder"]
 
 
 def sizes(folder: Path) -> dict[str, int]:
@@ -25,7 +25,7 @@ async def test_a_killed_recorder_does_not_affect_the_robot_and_its_file_is_recov
     folder = home.folder / "bags"
     file = home.deployment(
         resume="auto",
-        hosts={"robot": ALL},
+        hosts={"robot": ALL_PROCESSES},
         recorder={"folder": str(folder), "keep_free_mb": 0},
     )
     up = home.start("up", str(file))

@@ -20,7 +20,7 @@ from gigabrain_drivers.lidars.rplidar.protocol import DENSE, EXPRESS, STANDARD, 
 from gigabrain_drivers.lidars.rplidar.source import Rplidar, RplidarOptions
 from gigabrain_zenoh.clock import Clock, FakeClock
 from gigabrain_zenoh.testing.waiting import until
-from tests.system.lidars import LIDAR, Listener, agree, emulated, truth
+from tests.system.lidars import LIDAR, Listener, agreement, emulated, truth
 
 
 def options(folder: Path, **settings: Any) -> RplidarOptions:
@@ -53,7 +53,7 @@ async def test_a_scan_of_each_model_is_the_scan_of_the_simulation(
 ) -> None:
     its = options(tmp_path, model=model, scan_mode=scan_mode)
     async with emulated(RplidarDevice, its) as station, listen(its) as listener:
-        scan = (await listener.more(2))[-1]
+        scan = (await listener.next_scans(2))[-1]
         device = station.device
 
         assert isinstance(device, RplidarDevice)
@@ -62,7 +62,7 @@ async def test_a_scan_of_each_model_is_the_scan_of_the_simulation(
         missing = int(np.isnan(scan.ranges_m).sum())
         # standard scans of an A1 have 200 samples per turn
         assert missing <= (165 if kind == STANDARD and model == "a1" else 0)
-        assert agree(scan, truth()) > 0.97 - missing / 360
+        assert agreement(scan, truth()) > 0.97 - missing / 360
         await until(lambda: listener.source.health.connected)
         assert listener.source.health.errors == 0
 
@@ -70,26 +70,26 @@ async def test_a_scan_of_each_model_is_the_scan_of_the_simulation(
 async def test_a_lidar_that_was_rebooted_is_started_again(tmp_path: Path) -> None:
     its = options(tmp_path, model="c1")
     async with emulated(RplidarDevice, its) as station, listen(its) as listener:
-        await listener.more(1)
+        await listener.next_scans(1)
         station.set(Faults(reboot=True))
         await asyncio.sleep(0.1)
         station.set(NO_FAULTS)
         assert isinstance(station.device, RplidarDevice)
         assert station.device._mode is None
 
-        await listener.more(2)
+        await listener.next_scans(2)
 
 
 async def test_a_lidar_that_was_unplugged_is_started_again(tmp_path: Path) -> None:
     its = options(tmp_path, model="c1")
     async with emulated(RplidarDevice, its) as station, listen(its) as listener:
-        await listener.more(1)
+        await listener.next_scans(1)
         station.set(Faults(unplugged=True))
         await until(lambda: not listener.source.link.connected)
         station.device.reset()  # it loses power with its cable
         station.set(NO_FAULTS)
 
-        await listener.more(2)
+        await listener.next_scans(2)
         assert listener.source.health.reconnects >= 1
 
 
@@ -104,7 +104,7 @@ async def test_without_a_model_the_baud_rates_are_tried_in_turn(
             await until(lambda: source.baud == 460_800)
             await until(lambda: source.baud == 1_000_000)
             station.set(NO_FAULTS)
-            await listener.more(1)
+            await listener.next_scans(1)
 
 
 @pytest.mark.parametrize(
@@ -156,7 +156,7 @@ async def test_another_model_than_in_the_file_is_reported_in_one_line(
         emulated(RplidarDevice, options(tmp_path, model="a2m8")),
         listen(options(tmp_path, model="a1")) as listener,
     ):
-        await listener.more(1)
+        await listener.next_scans(1)
         logged = [record.message for record in caplog.records]
         assert f"RPLIDAR A2 on {tmp_path}/scan, firmware 1.29" in logged
         assert f"the lidar on {tmp_path}/scan is an RPLIDAR A2, not model: a1" in logged
@@ -170,7 +170,7 @@ async def test_a_lidar_in_protection_stop_is_reset(
         assert isinstance(station.device, RplidarDevice)
         station.device.health = Health(2, 0x8001)
         async with listen(its) as listener:
-            await listener.more(1)
+            await listener.next_scans(1)
             assert station.device.health == Health(0, 0)
 
 
@@ -178,7 +178,7 @@ async def test_closing_stops_the_measurement_and_the_motor(tmp_path: Path) -> No
     its = options(tmp_path, model="s2")
     async with emulated(RplidarDevice, its) as station:
         async with listen(its) as listener:
-            await listener.more(1)
+            await listener.next_scans(1)
         assert isinstance(station.device, RplidarDevice)
         await until(lambda: station.device._turn_hz == 0.0)
         assert station.device._mode is None
@@ -190,7 +190,7 @@ async def test_the_motor_of_an_a1_turns_while_dtr_is_cleared(
     its, line = options(tmp_path, model="a1"), list[bool]()
     async with emulated(RplidarDevice, its), listen(its) as listener:
         listener.source.link.set_dtr = line.append
-        await listener.more(1)
+        await listener.next_scans(1)
         assert line == [False]
     assert line == [False, True]
 

@@ -66,16 +66,16 @@ def test_the_docs_list_the_rights_of_a_unit_with_can_and_cameras(unit: Path) -> 
     assert {"AF_CAN", "char-video4linux"} <= {*re.split(r"[\s=]", more)}
 
 
-BARE = """
+READ_ONLY_SHELL = """
 mount --bind {folder} {folder} && mount -o remount,bind,ro / &&
 exec setpriv --no-new-privs --bounding-set=-all --inh-caps=-all -- "$@"
 """
 
 
 @pytest.fixture
-def bare(tmp_path: Path) -> Iterator[Home]:
+def read_only_home(tmp_path: Path) -> Iterator[Home]:
     """Return a home on an otherwise read-only system, for processes without capabilities."""
-    inside = ("unshare", "--mount", "--", "sh", "-c", BARE.format(folder=tmp_path), "sh")
+    inside = ("unshare", "--mount", "--", "sh", "-c", READ_ONLY_SHELL.format(folder=tmp_path), "sh")
     if not all(map(shutil.which, ("unshare", "setpriv", "mount"))):
         pytest.skip("no unshare, setpriv and mount here")
     if subprocess.run((*inside, "true"), capture_output=True).returncode:
@@ -88,12 +88,14 @@ def bare(tmp_path: Path) -> Iterator[Home]:
 
 
 @pytest.mark.slow
-async def test_a_robot_runs_without_capabilities_on_a_read_only_system(bare: Home) -> None:
-    file = bare.deployment(resume="auto")
-    up = bare.start("up", str(file))
+async def test_a_robot_runs_without_capabilities_on_a_read_only_system(
+    read_only_home: Home,
+) -> None:
+    file = read_only_home.deployment(resume="auto")
+    up = read_only_home.start("up", str(file))
     async with probing(endpoint_of(file)) as robot:
         await robot.driving_straight(0.15, room=0.0)
-    (note,) = bare.folder.glob("run/gigabrain/*.json")
+    (note,) = read_only_home.folder.glob("run/gigabrain/*.json")
     before = note.stat().st_mtime_ns
     await until(lambda: note.stat().st_mtime_ns > before, "the note of a robot that is well")
     assert up.err == ""

@@ -39,7 +39,7 @@ async def demo(shared_home: Home) -> Home:
 
 
 @contextlib.asynccontextmanager
-async def looking(home: Home) -> AsyncIterator[Probe]:
+async def probe_of(home: Home) -> AsyncIterator[Probe]:
     """Yield a probe of the robot of this home."""
     (note,) = (home.folder / "run" / "gigabrain").glob("*.json")
     endpoint = msgspec.json.decode(note.read_bytes(), type=Running).endpoint
@@ -49,14 +49,14 @@ async def looking(home: Home) -> AsyncIterator[Probe]:
 
 async def until_driving(home: Home) -> None:
     """Repair the robot and wait until the brain drives."""
-    async with looking(home) as seen:
+    async with probe_of(home) as seen:
         while (seen.state.gate.mode, seen.state.gate.commander) != ("enabled", BRAIN):
             if seen.state.gate.mode == "idle":
                 await seen.enable_brain()
             await seen.ticks(5)
 
 
-async def printed(home: Home, *arguments: str) -> str:
+async def output_of(home: Home, *arguments: str) -> str:
     """Run a command that must succeed, and return its output."""
     command = await home.run(*arguments)
     assert await command.ended() == 0, command.err
@@ -68,7 +68,7 @@ async def test_topic_commands_list_show_and_measure_topics(demo: Home) -> None:
         "list", "echo scan -n 1", "echo state --json -n 3", "hz scan -n 1", "bw scan -n 1",
         "delay scan -n 1", "info scan",
     )  # fmt: skip
-    outputs = [printed(demo, "topic", *command.split()) for command in commands]
+    outputs = [output_of(demo, "topic", *command.split()) for command in commands]
     table, scan, states, hz, size, delay, about = await asyncio.gather(*outputs)
     assert re.search(r"^scan +LaserScan +\d+\.\d +10 +\d{4} .* driver +perception", table, re.M)
     assert re.search(r"^ranges: 360 values, min ", scan, re.M)
@@ -95,7 +95,7 @@ async def test_a_message_published_by_command_arrives(demo: Home) -> None:
     for _ in range(20):
         if not ear.running:
             break
-        await printed(demo, "topic", "pub", "teleop", "linear_x=0", "--rate", "20", "-n", "3")
+        await output_of(demo, "topic", "pub", "teleop", "linear_x=0", "--rate", "20", "-n", "3")
     assert await ear.ended() == 0
     assert ear.out == "linear_x=0\n"
     assert await (await demo.run("enable", "--take")).ended() == 0
@@ -114,7 +114,7 @@ async def test_a_velocity_command_takes_the_body_and_returns_it(demo: Home) -> N
     else:
         raise AssertionError(driven.out + driven.err)
     driving = demo.start("topic", "pub", "cmd_vel", "linear_x=0.1", "--take", "--rate", "20")
-    async with looking(demo) as seen:
+    async with probe_of(demo) as seen:
         await until(lambda: seen.state.gate.commander.endswith("-pub"), "it is driven by hand")
     driving.send(signal.SIGINT)
     assert await driving.ended() == 0
@@ -124,7 +124,7 @@ async def test_a_velocity_command_takes_the_body_and_returns_it(demo: Home) -> N
 async def test_processes_and_their_graph_are_shown(demo: Home) -> None:
     commands = ("node list", "node info driver", "graph", "top --once")
     table, driver, graph, once = await asyncio.gather(
-        *(printed(demo, *command.split()) for command in commands)
+        *(output_of(demo, *command.split()) for command in commands)
     )
     assert {line.split()[0] for line in table.splitlines()} >= set(ORDER)
     assert "stale_commands_executed" in driver
@@ -136,18 +136,18 @@ async def test_processes_and_their_graph_are_shown(demo: Home) -> None:
 async def test_the_log_names_the_user_who_changed_a_parameter(demo: Home) -> None:
     follow = demo.start("log", "--follow", "--process", "decision", "--json", "-n", "1")
     await until(lambda: follow.out, "the log's past")
-    output = await printed(demo, "param", "set", "decision", "max_linear_speed", "0.15")
+    output = await output_of(demo, "param", "set", "decision", "max_linear_speed", "0.15")
     assert output == "decision: max_linear_speed is 0.15 now, it was 0.2\n"
-    assert await printed(demo, "param", "get", "decision", "max_linear_speed") == "0.15\n"
+    assert await output_of(demo, "param", "get", "decision", "max_linear_speed") == "0.15\n"
     refused = await demo.run("param", "set", "decision", "max_linear_speed", "fast")
     assert await refused.ended() == 1
     assert "expected a number above 0" in refused.err
-    await printed(demo, "param", "set", "decision", "max_linear_speed", "0.2")
+    await output_of(demo, "param", "set", "decision", "max_linear_speed", "0.2")
     wanted = "max_linear_speed is 0.2 now, it was 0.15"
     await until(lambda: wanted in follow.out, "the change in the log")
     follow.send(signal.SIGINT)
     assert await follow.ended() == 0
-    assert wanted in await printed(demo, "log", "--process", "decision", "--since", "10m")
+    assert wanted in await output_of(demo, "log", "--process", "decision", "--since", "10m")
 
 
 @pytest.mark.parametrize(
@@ -193,7 +193,7 @@ async def test_an_e_stop_is_shown_with_its_remedy(demo: Home) -> None:
     assert await latched.ended() == 18
     explained = json.loads(latched.out)
     assert "latched" in {one["link"]: one["text"] for one in explained["findings"]}["gate"]
-    async with looking(demo) as seen:
+    async with probe_of(demo) as seen:
         await seen.at_rest(30)
     assert await (await demo.run("release")).ended() == 0
     idle = await demo.run("why")
@@ -217,8 +217,8 @@ async def test_a_closed_pipe_ends_a_command_without_an_error(demo: Home) -> None
         read, write = os.pipe()
         command = demo.start(*arguments, stdout=write)
         os.close(write)
-        with os.fdopen(read, "rb") as printed:
-            await asyncio.to_thread(printed.readline)
+        with os.fdopen(read, "rb") as output_of:
+            await asyncio.to_thread(output_of.readline)
         await command.ended()
         return command.err
 
@@ -258,7 +258,7 @@ async def test_a_body_with_its_own_control_topic_is_driven_and_explained(
     driving = home.start(
         "topic", "pub", "base/cmd", "linear_x=0", "angular_z=0.8", "--take", "--rate", "20"
     )
-    async with looking(home) as seen:
+    async with probe_of(home) as seen:
         await until(lambda: seen.state.velocity.angular_z > 0.5, "it turns left")
     driving.send(signal.SIGINT)
     assert await driving.ended() == 0

@@ -74,13 +74,13 @@ async def test_a_router_waits_for_its_own_address_with_one_warning(
     monkeypatch.setattr(connect, "RETRY_S", 0.01)
     here, bind, queries = free_endpoint(), socket.socket.bind, list[object]()
 
-    def late(self: socket.socket, address: tuple[str, int]) -> None:
+    def bind_late(self: socket.socket, address: tuple[str, int]) -> None:
         queries.append(address)
         if len(queries) < 4:  # as before a DHCP lease
             raise OSError(errno.EADDRNOTAVAIL, "Cannot assign requested address")
         bind(self, address)
 
-    monkeypatch.setattr(socket.socket, "bind", late)
+    monkeypatch.setattr(socket.socket, "bind", bind_late)
     transport = await open_session(Endpoint(listen=(here,)))
     await transport.close()
     assert warnings(caplog) == [

@@ -26,13 +26,13 @@ from gigabrain_zenoh.testing.processes import (
 from gigabrain_zenoh.testing.waiting import until
 from tests.places import ROOT
 
-ALL = ["router", "driver", "perception", "decision", "control", "safety"]
-READY = re.compile(r"^\S+ (\w+) +info +ready pid=\d+$", re.MULTILINE)
+ALL_PROCESSES = ["router", "driver", "perception", "decision", "control", "safety"]
+READY_LINE = re.compile(r"^\S+ (\w+) +info +ready pid=\d+$", re.MULTILINE)
 
 
 def ready(command: CommandProcess) -> list[str]:
     """Return the processes in the order in which they became ready."""
-    return READY.findall(command.out)
+    return READY_LINE.findall(command.out)
 
 
 async def test_up_starts_in_order_of_readiness_restarts_dead_processes_and_ends_cleanly(
@@ -45,7 +45,7 @@ async def test_up_starts_in_order_of_readiness_restarts_dead_processes_and_ends_
         "turtlebot3_waffle on robot: router, driver, perception, decision, control, safety; "
     )
     assert ready(up)[0] == "router"
-    assert sorted(ready(up)) == sorted(ALL)
+    assert sorted(ready(up)) == sorted(ALL_PROCESSES)
     assert len(home.processes()) == 6
     async with probing(endpoint_of(file)) as robot:
         os.kill(await robot.pid("safety"), signal.SIGKILL)

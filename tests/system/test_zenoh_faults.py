@@ -241,7 +241,7 @@ async def test_closing_does_not_wait_for_a_reconnection() -> None:
         await until(lambda: session_threads() <= others)
 
 
-def stuck(sender: ZenohTransport) -> None:
+def fill_link(sender: ZenohTransport) -> None:
     """Send more than the kernel buffers to a router that does not read."""
     for _ in range(200):
         sender.publish(SCAN, "robot/scan", bytes(100_000), "")
@@ -270,7 +270,7 @@ async def test_closing_does_not_wait_for_a_lost_router(router_is: str) -> None:
 
 
 async def test_closing_does_not_wait_for_a_stuck_link() -> None:
-    await close_with_router("frozen", stuck)
+    await close_with_router("frozen", fill_link)
 
 
 async def test_publishing_into_a_stuck_link_does_not_block_the_loop() -> None:
@@ -280,7 +280,7 @@ async def test_publishing_into_a_stuck_link_does_not_block_the_loop() -> None:
         client = await client_of(endpoint)
         router.freeze()
         async with asyncio.timeout(60):  # a blocking publisher would take 5 s each
-            stuck(client)
+            fill_link(client)
             await asyncio.sleep(0)
         await client.close()
     await until(lambda: session_threads() <= others)
