@@ -353,7 +353,7 @@ async def test_the_classes_of_the_net_are_published_once_a_second():
         received: list[tuple[str, Labels]] = []
         robot.bus.subscribe(LABELS, lambda key, message: received.append((key, message)))
         for tick in (41, 90, 91, 140, 141):
-            robot.be(tick)
+            robot.publish_state(tick)
             await settle()
         assert [key for key, _ in received] == ["robot/labels/recognition"] * 2  # 40 was before
         labels = received[0][1].labels
@@ -362,7 +362,7 @@ async def test_the_classes_of_the_net_are_published_once_a_second():
 
 
 def test_a_class_without_a_name_or_named_twice_is_published_once_or_never():
-    net = SeesABall()
+    net = BallNet()
     net.classes = ("can", "", "ball", "can")
     assert Observer(net, TagFinder()).labels == ("can", "ball")
     assert Observer(None, TagFinder()).labels == ()

@@ -192,7 +192,7 @@ async def test_an_object_name_given_as_place_is_refused_with_the_right_command()
 async def test_a_label_that_nothing_recognises_is_refused_with_the_nearest(
     request_: GoalRequest | MissionRequest,
 ) -> None:
-    async with Seeing() as plane:
+    async with CameraPlane() as plane:
         plane.labels = {"recognition": ("can", "ball"), "mine": ("cup",)}
         await plane.go(2.0)
         service = GOAL if isinstance(request_, GoalRequest) else MISSION
@@ -203,7 +203,7 @@ async def test_a_label_that_nothing_recognises_is_refused_with_the_nearest(
 
 
 async def test_a_label_that_only_another_process_recognises_is_sought() -> None:
-    async with Seeing() as plane:
+    async with CameraPlane() as plane:
         plane.labels = {"recognition": ("can", "ball"), "mine": ("cup",)}
         await plane.go(2.0)
         reply = await plane.ask(GOAL, GoalRequest(object="cup"))
@@ -211,7 +211,7 @@ async def test_a_label_that_only_another_process_recognises_is_sought() -> None:
 
 
 async def test_a_remembered_thing_is_found_though_its_label_is_no_longer_recognised() -> None:
-    async with Seeing(thing(3, 2.8, 1.2, "shoe")) as plane:
+    async with CameraPlane(map_object(3, 2.8, 1.2, "shoe")) as plane:
         plane.labels = {"recognition": ("can", "ball")}
         await plane.go(2.0)
         reply = await plane.ask(GOAL, GoalRequest(object="shoe"))
@@ -219,7 +219,7 @@ async def test_a_remembered_thing_is_found_though_its_label_is_no_longer_recogni
 
 
 async def test_any_label_is_sought_once_the_recogniser_has_been_silent_for_five_seconds() -> None:
-    async with Seeing() as plane:
+    async with CameraPlane() as plane:
         plane.labels = {"recognition": ("can", "ball")}
         await plane.go(2.0)
         assert not (await plane.ask(GOAL, GoalRequest(object="cann"))).ok
