@@ -46,12 +46,12 @@ def work_for(do: ArmAction, now: WorkInputs) -> Callable[[], Planned] | str:
     """Return a function that plans an action, or why it cannot be planned."""
     planner, body, hold = now.arm.planner, now.arm.body, now.hold
     if len(now.arm.state.joints_sent) != len(body.joints):
-        return "the joints are not measured, or limp"
+        return "the joints are limp or not measured"
     name = thing_meant(do)
     if name is not None and hold:
         return f"the gripper holds {hold.thing.name} already"
     if name is not None and name not in now.things:
-        return f"where {name} is, is not known"
+        return f"the place of {name} is not known"
     posture = now.arm.sent_posture
     others = {other: thing_of(other, solid) for other, solid in now.things.items()}
     thing = others.pop(name) if name is not None else None

@@ -29,7 +29,7 @@ from gigabrain_zenoh.geometry.pose import PoseHistory, compose, inverse, velocit
 
 MAX_POSE_AGE_NS = 1_000_000_000
 SENT_TICKS = 25  # local planning uses the commands of the last half second
-OPERATOR_HOLDS = "an operator holds the body; `gigabrain enable` hands it back"
+OPERATOR_HOLDS = "an operator drives; `gigabrain enable` lets the brain drive again"
 USUAL_LATENCY_TICKS = 2  # from a scan to the first state that follows its intent
 LATENCY_MEMORY_TICKS = 100
 STOPPED_AHEAD_TICKS = 75  # then the local planner looks for another way out
@@ -230,7 +230,7 @@ class ContextSource:
             why = "; ".join(cause.text for cause in gate.causes)
             return f"the gate is {gate.mode}{f': {why}' if why else ''}"[:300]
         if gate.commander != BRAIN:
-            return f"{gate.commander} has the body"
+            return f"{gate.commander} drives"
         for commands in (self._commands, self._joint_commands):
             command = commands.at(state.boot, state.tick, STATE.stale_after_ns)
             if command and command.operator:

@@ -35,7 +35,7 @@ class ContourFilter:
             far = f"corners more than {MAX_DISTANCE_M:.0f} m from the body"
             self._fault.begin(f"refused {refused} contours with {far}; check perception")
         else:
-            self._fault.end("all contours are possible again")
+            self._fault.end("all contours are plausible again")
         height = body.body_height if body else math.inf
         blocking = tuple(contour for contour in possible if contour.bottom < height)
         return with_contours(replace(world, contours=blocking), body)

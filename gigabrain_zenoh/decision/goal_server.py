@@ -45,7 +45,7 @@ if TYPE_CHECKING:
     from gigabrain_zenoh.decision.manipulator import Manipulator
     from gigabrain_zenoh.decision.navigator import Navigator
 
-NOT_BEGUN = Idle("waiting", "waiting: for the body and the map's places, to begin its mission")
+NOT_BEGUN = Idle("waiting", "waiting: the mission needs the body and the map's places first")
 COMPILING = "mapping and planning compile meanwhile, once per installation"
 FIRST_MAP_TICKS = 3000  # wait for a first map, once the kernels are loaded
 STARTING_STATUS_NS = 200_000_000  # period of the status while the kernels compile

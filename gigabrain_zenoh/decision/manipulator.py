@@ -68,12 +68,12 @@ TRIES = 3  # grasps of a thing, each one different
 HOLD_UPS = 5  # a command with more hold-ups fails
 MAX_RESULTS = 64  # of commands, that are remembered
 WAIT_TICKS = 100  # until the arm plans again, for a joint that the gate holds back
-MISSED = f"it was not caught, {TRIES} times"
+MISSED = f"the gripper missed it {TRIES} times"
 CARRYING = ("lift", "traverse", "lower", "move")  # phases in which the gripper must hold a thing
 NO_MODEL = Idle("waiting", "waiting: for the arm's model, robot/arm_model")
 NOT_MEASURED = Idle("waiting", "waiting: for all joints to be measured")
 PLANNING = Idle("planning", "planning")
-OFFERING = "waiting for somebody to pull at {}; `gigabrain task resume` lets go of it"
+OFFERING = "waiting for a person to pull at {}; `gigabrain task resume` opens the gripper"
 GRIPPER_STAYS = "so the gripper stays; `place` and `gripper` let go of it"
 
 
@@ -319,7 +319,7 @@ class Manipulator:
                 self._achieved = self._success(str(pressure))
                 self._results.append(self._achieved)
             else:
-                self._failure = f"nothing was touched, {do.depth * 100:g} cm behind that place"
+                self._failure = f"nothing was touched up to {do.depth * 100:g} cm behind that place"
             self._abandoned, self._detour = self._plan, True
             hold_s = do.seconds if touched else 0.0
             self._begin(arm, arm.planner.after_press(self._plan, arm.sent_posture, hold_s))

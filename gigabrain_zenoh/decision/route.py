@@ -286,7 +286,7 @@ class RoutePlanner:
             other = nearest(request.walkers, give_way.left, SAME_M)
         else:
             other = nearest(standing(request.walkers, request.seen), here, NEAR_M)
-        why = "somebody is in the way"
+        why = "a person or a moving obstacle is in the way"
         stuck = self._progress.stuck(request.tick, STANDING_TICKS)
         cell = costs.cell(goal.x, goal.y) if goal else None
         if goal and cell is not None and costs.cost[cell] > LETHAL:
@@ -341,11 +341,11 @@ class RoutePlanner:
         if goal is None:
             if aside := self._move_aside(None, request, costs):
                 return aside
-            reason = f"no free and reachable place before {target.name}"
+            reason = f"no free and reachable place in front of {target.name}"
             ended = self._progress.stuck(request.tick, WAY_OPENS_TICKS)
             return self._route(state="failed" if ended else "running", reason=reason)
         route = self._to_goal(goal, request, costs)
-        before = f"before {target.name}"
+        before = f"in front of {target.name}"
         return replace(route, reason=f"{before}, {route.reason}" if route.reason else before)
 
     def _look(self, request: RouteRequest, costs: Costmap) -> Route:
@@ -377,21 +377,21 @@ class RoutePlanner:
         if route.state == "running":
             return route
         if not looks.settled(request.tick):
-            return self._route(reason="looking at the last places")
+            return self._route(reason="looking at the last unseen places")
         if looks.look_closer():
             self._missed.clear()
-            return self._route(reason="looking at all again, from nearer by")
+            return self._route(reason="looking at everything again, from nearer")
         if looks.ended_tick is None:
             looks.ended_tick = request.tick
         if aside := self._move_aside(None, request, costs):
             looks.ended_tick = request.tick
             return aside
         if request.tick - looks.ended_tick < WAY_OPENS_TICKS:
-            return self._route(reason="everything reachable was looked at; waiting for other ways")
+            return self._route(reason="everything reachable was seen; waiting for another way")
         if self._missed and looks.try_again():
             self._missed.clear()
-            return self._route(reason="trying again to get to unexplored space")
-        return replace(route, reason="everything reachable was looked at")
+            return self._route(reason="trying again to reach unexplored space")
+        return replace(route, reason="everything reachable was seen")
 
     def _explored(self, request: RouteRequest, costs: Costmap) -> Route:
         """End the exploration once updates of the map bring no new frontier."""

@@ -233,7 +233,7 @@ class TaskServer:
         before = self._zones.newest_loaded
         yield
         if before not in (None, self._zones.newest_loaded):
-            raise Refused("another map was loaded meanwhile; send it again for this one")
+            raise Refused("another map was loaded meanwhile; send the goal again for this map")
 
     async def _on_goal(self, request: GoalRequest) -> GoalReply:
         try:
@@ -281,7 +281,7 @@ class TaskServer:
         if body and not body.cameras:
             raise Refused("the robot has no cameras; start it with --cameras, or `cameras: on`")
         if body and not body.fixed_cameras:
-            raise Refused("the robot has no camera but on its arm; finding needs one on its base")
+            raise Refused("the robot has a camera on its arm only; finding needs one on its base")
 
     def _seek(self, wanted: Wanted, without: Collection[int], preferred: int | None) -> Sought:
         """Return what is known of a wanted object or tag at the current step."""

@@ -243,7 +243,7 @@ class ArmPlanner:
         if at is not None:
             return self.reach(at, pitch, things, posture, hold)
         pitches = OFFER_PITCHES if pitch is None else (pitch,)
-        fault = NoWay(reason="there is no place before it where it can be offered")
+        fault = NoWay(reason="there is no free place in front of the arm to hand it over")
         for ahead, up in OFFERS:
             point = self._reach * np.array([ahead, 0.0, up])
             for one in pitches:

@@ -99,8 +99,8 @@ class PickPlacePlanner:
         if isinstance(found, NoGrasp):
             return NoWay(reason=found.reason)
         if without >= len(found):
-            return NoWay(reason=f"{thing.name}: all {len(found)} ways to grasp it have failed")
-        fault = NoWay(reason=f"{thing.name}: no way to it")
+            return NoWay(reason=f"{thing.name}: all {len(found)} grasps have failed")
+        fault = NoWay(reason=f"{thing.name}: no path to it")
         for grasp in found[without : without + TRIES]:
             one = self._pick(grasp, thing, others, posture)
             if isinstance(one, Pick):

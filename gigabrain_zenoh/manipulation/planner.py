@@ -102,7 +102,7 @@ def plan(
     if not checker.is_line_free(begin, goal):
         found = _connect_trees(checker, begin, goal, random, until)
         if found is None:
-            return NoPath(cause="time", reason=f"no way round was found within {time_limit:g} s")
+            return NoPath(cause="time", reason=f"no path was found within {time_limit:g} s")
         way = _shorten(checker, found, random)
     return JointPath(postures=np.array(way if begin is start else [start, *way]))
 

@@ -128,7 +128,7 @@ class Autosave:
             return
         if not self._job.done():
             if tick > self._began_tick + STALLED_TICKS:
-                self.problem = _unsaved_cause(f"{self._slots[0]}: the disk does not take it")
+                self.problem = _unsaved_cause(f"{self._slots[0]}: saving takes too long")
             return
         job, self._job, failed = self._job, None, ""
         try:
@@ -182,8 +182,8 @@ def _write(path: Path, header: SaveHeader, snapshot: "MapSnapshot") -> int:
 def _unsaved_cause(why: str) -> Cause:
     return Cause(
         code="map_unsaved",
-        text=f"the map is not saved, and would be lost with perception: {why}"[:500],
-        remedy="make room on the disk, and see that the folder can be written",
+        text=f"the map is not saved; it is lost if perception ends: {why}"[:500],
+        remedy="make room on the disk, and check that the folder is writable",
     )
 
 

@@ -280,7 +280,7 @@ def edges_from_arrays(name: str, arrays: Arrays) -> list[Edge]:
     if ends.ndim != 2 or relative.shape != (len(ends), 3) or covariance.shape != (len(ends), 3, 3):
         raise ValueError(f"{name}: {len(ends)} edges, but {len(relative)} poses")
     if not ((ends >= 0) & (ends < keyframes)).all():
-        raise ValueError(f"{name}: joins keyframes that there are not, of {keyframes}")
+        raise ValueError(f"{name}: joins keyframes that do not exist, of {keyframes}")
     if not (np.linalg.eigvalsh(covariance) > 0).all():
         raise ValueError(f"{name}: expected positive definite covariances")
     rows = zip(ends, relative, covariance, arrays[f"{name}_doubtful"], strict=True)

@@ -47,7 +47,7 @@ NOWHERE = np.diag((1e3, 1e3, math.pi)) ** 2  # covariance of an unknown pose
 
 SAME_SCORE_BAND = 0.1  # below the best: a hint does not distinguish its places in this band
 HINT_INTERVAL_SCANS = 3  # between hints that a localized robot checks
-ELSEWHERE = "a tag says that it is elsewhere, and so does the scan"
+ELSEWHERE = "a tag and the scan place the robot elsewhere"
 SEARCH_DEADLINE_SCANS = 8  # after which the result of a search is used
 
 JUDGED_RADIUS_M = 5.0  # round the robot; beams that end farther away are not judged
@@ -172,11 +172,11 @@ class Localizer:
         """Lose the robot if its place no longer fits or is too uncertain."""
         here = self._places[0]
         if here.bad_scans >= LOST_SCANS:
-            self.lose("what is seen is not where the robot was thought to be")
+            self.lose("the scans do not fit the robot's place in the map")
             return
         deviations = np.sqrt(np.diag(here.covariance))
         if max(deviations[0], deviations[1]) > MAX_DEVIATION_M or deviations[2] > MAX_DEVIATION_RAD:
-            self.lose("nothing to go by was seen for too long")
+            self.lose("the scans did not confirm the robot's place for too long")
 
     def _check_hypotheses(self) -> None:
         """Drop places that scans contradict; localize the robot when one is confirmed."""
@@ -195,7 +195,7 @@ class Localizer:
             if apart(one.pose, (other.pose for other in self._places)):
                 self._places.append(one)
         if all(one.bad_scans >= LOST_SCANS for one in self._places):
-            self.lose("no place in the map looks like this")
+            self.lose("no place in the map matches the scans")
         elif (confirmed := self._confirmed()) is not None:
             self._places, self._localized, self.why = [confirmed], True, ""
         else:
@@ -240,8 +240,8 @@ def _nearest_to_odometry(poses: list[Floats], last: Floats) -> int | None:
 
 
 def _in_words(count: int) -> str:
-    places = {0: "no place in the map looks like this", 1: "one place looks like this"}
-    return places.get(count, f"it could be in {count} places")
+    places = {0: "no place in the map matches the scans", 1: "one place matches the scans"}
+    return places.get(count, f"{count} places match the scans")
 
 
 def _predicted(one: Hypothesis, motion: Floats, noise: Floats) -> Hypothesis:

@@ -93,12 +93,12 @@ def load_graph(path: Path) -> dict[str, NDArray[Any]]:
     """Load the pose graph beside the YAML file `path`. Raises ConfigError, in one line."""
     _finish_save(path)
     file = path.with_suffix(GRAPH)
-    graph = read_arrays(file, "the pose graph to go on with; expected it beside the YAML file")
+    graph = read_arrays(file, "the map's pose graph; expected it beside the YAML file")
     grid_hash = graph.pop(GRID_HASH, None)
     if grid_hash is not None and not np.array_equal(grid_hash, _grid_hash(load(path))):
         raise ConfigError(
-            f"{file}: belongs to another map than {path}; bring back what was saved together, "
-            "or find the way in that map as it is (mapping: localize)"
+            f"{file}: belongs to another map than {path}; restore the files that were saved "
+            "together, or only localize in the map (mapping: localize)"
         )
     return graph
 
@@ -291,11 +291,11 @@ def _read_array(name: str, members: zipfile.ZipFile, info: zipfile.ZipInfo) -> N
     with members.open(info) as stream:
         shape, fortran, dtype = NPY_HEADERS[np.lib.format.read_magic(stream)](stream)
         if dtype.kind not in "biuf" or min(shape, default=0) < 0:
-            raise ValueError(f"{name} holds something else than numbers")
+            raise ValueError(f"{name} holds data other than numbers")
         data = stream.read()  # of bounded size; zipfile checks the checksum
     if len(data) != math.prod(shape) * dtype.itemsize:
         raise ValueError(f"{name}: {len(data)} bytes for {shape} of {dtype}")
     values: NDArray[Any] = np.frombuffer(data, dtype).reshape(shape, order="F" if fortran else "C")
     if values.size and not -MAX_NUMBER <= values.min() <= values.max() <= MAX_NUMBER:
-        raise ValueError(f"{name} holds something else than numbers up to {MAX_NUMBER:g}")
+        raise ValueError(f"{name} holds data other than numbers up to {MAX_NUMBER:g}")
     return values

@@ -188,7 +188,7 @@ class SlamMap:
         )
         self._motion, self._kidnap_suspected = IDENTITY, False
         if estimate.lost:
-            self.lose("scans do not fit together any more")
+            self.lose("the scans no longer match each other")
             return self._last_place
         self._draw_if_due(view, estimate)
         if self._slam.behind and self._background.idle and not self._settling:
@@ -245,7 +245,7 @@ class SlamMap:
         """See RobotMap. Waits for background work."""
         self._settling = False
         if self._finder or not self._slam.keyframes:
-            raise Refused(f"not saved: where the robot is, is not known ({self._last_place.why})")
+            raise Refused(f"not saved: the robot is not localized ({self._last_place.why})")
         self._background.finish()
         return self._copy()
 
@@ -275,7 +275,7 @@ class SlamMap:
         """See RobotMap."""
         found = [FULL] if self._grid.full else []
         if self._slam.failure:
-            text = f"loops are closed no more, the optimiser fails: {self._slam.failure}"
+            text = f"loops are no longer closed, as the optimiser fails: {self._slam.failure}"
             found.append(Cause(code="loops_open", text=text, remedy=SAVE_AND_GO_ON))
         return tuple(found)
 
@@ -314,7 +314,7 @@ class SlamMap:
         if not self._kidnap_detector.look(self._grid, view, pose):
             return False
         if self._kidnap_detector.certain:
-            self.lose("what is seen is not where the robot was thought to be")
+            self.lose("the scans do not fit the robot's place in the map")
         else:
             self._last_place = Place(pose, self._last_place.covariance, True)
         return True

@@ -117,7 +117,7 @@ class StaticMap(RobotMap):
 
     def still(self) -> "MapSnapshot":
         """Refuse: the map is saved already."""
-        raise Refused("not saved: perception finds its way in a saved map, it makes none")
+        raise Refused("not saved: perception only localizes in a saved map; set mapping: slam")
 
     def report(self) -> dict[str, int]:
         """See RobotMap."""

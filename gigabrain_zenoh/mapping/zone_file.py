@@ -64,7 +64,9 @@ def encoded(zones: ZoneFile) -> bytes:
     """Return the content of a file. Raises Refused if it would be too large to load."""
     data = "".join((HEAD, f"version: {VERSION}\n", *_lines(zones))).encode()
     if len(data) > loading.MAX_BYTES:
-        raise Refused(f"not saved: {len(data)} bytes of zones; at most {loading.MAX_BYTES} do")
+        raise Refused(
+            f"not saved: {len(data)} bytes of zones; expected at most {loading.MAX_BYTES}"
+        )
     return data
 
 

@@ -75,10 +75,10 @@ class CarPlanner:
         begin, end = _pose(start), (goal.x, goal.y, math.nan if goal.yaw is None else goal.yaw)
         needs = _needs(terrain, car, begin, end)
         if needs is None:
-            return Unreachable(fault="the goal is too close to something for this heading")
+            return Unreachable(fault="the goal is too close to an obstacle for this heading")
         last = hybrid.search(terrain, car, begin, end, needs, self._memory)
         if last == hybrid.ROOT:
-            return Unreachable(fault="no way leads to the goal that a car can drive")
+            return Unreachable(fault="no path leads to the goal that a car can drive")
         return self._path(terrain, car, end, last)
 
     def replan(

@@ -28,7 +28,7 @@ DETOUR_M = 3.0  # margin of the searched part of the map around the blocked part
 MAX_DETOUR_M = 15.0  # length of a path that a detour replaces
 MAX_CELL_PATH_RATIO = math.sqrt(4 - 2 * math.sqrt(2))  # of steps between cells to a straight line
 Point = tuple[float, float]  # [m], in the map's frame
-NO_WAY = "no way leads to the goal"
+NO_WAY = "no path leads to the goal"
 
 BLACKLIST_RADIUS_M = 0.5  # frontiers nearer to a blacklisted point are ignored
 SIZE_GAIN = 1.0  # metres of path that a metre of frontier is worth
@@ -149,7 +149,7 @@ class GlobalPlanner:
         column, row = _in_cells(costmap, np.array((goal,)))[0] - 0.5
         cell = self.search.nearest(costmap.cost, row, column)
         if cell is None:
-            return Unreachable(fault=f"{why}; the robot has no room to leave where it stands")
+            return Unreachable(fault=f"{why}; the robot has no room to move from its place")
         x, y = costmap.points(np.array(cell[:1]), np.array(cell[1:]))[0]
         away = math.hypot(x - goal[0], y - goal[1])
         return Unreachable(fault=why, nearest=(float(x), float(y)), distance=away)
@@ -229,12 +229,12 @@ def goal_problem(costmap: Costmap, goal: Point) -> str:
     if cell is None:
         return "the goal is outside the map"
     if costmap.cells[cell] >= OCCUPIED_PERCENT:
-        return "the goal is inside something"
+        return "the goal is inside an obstacle"
     if costmap.cost[cell] >= LETHAL and (problem := costmap.zone_problem(*goal)):
         return f"the goal {problem}"
     if costmap.cost[cell] > LETHAL:
         fits = costmap.inflation.fits
-        return f"the goal is too close to something: the body needs {fits:.2f} m"
+        return f"the goal is too close to an obstacle: the body needs {fits:.2f} m"
     if costmap.cost[cell] == LETHAL:
         return "the goal is in unknown space, which is forbidden"
     return ""

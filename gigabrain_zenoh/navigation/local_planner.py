@@ -41,8 +41,8 @@ LOOK_EVERY_S = 12.0  # then again
 WAY_ON_M = 0.4  # distance of the point of the path that it looks at
 FACES_RAD = 0.35  # heading error at which that point is in view
 BACK_M = 0.3  # distance by which it backs off from ground too near to be in view
-LOOKING = "looking: it has not seen the ground on its way"
-MAKING_WAY = "making way: it looks round for what moves"
+LOOKING = "looking: the ground ahead is not seen yet"
+MAKING_WAY = "making way: looking round for moving obstacles"
 STANDARD = Weights()
 ARRIVED_SPEED_SHARE = 0.05  # of the maximum speeds, at which a body has arrived
 
@@ -196,7 +196,7 @@ class LocalPlanner:
         looking_round = self._is_looking_round(request.tick)
         if looking_round:
             if weights is self._weights or dynamic_obstacles.stay_clear(discs, place.x, place.y):
-                return _standing("waiting: it looks round for what moves")
+                return _standing("waiting: looking round for moving obstacles")
             request = replace(request, goal=Goal(x=place.x, y=place.y), path=None, headings=None)
         viewpoint = self._viewpoint(request, place)
         if viewpoint:

@@ -43,15 +43,15 @@ def explain_plan(
     if left < AT_GOAL_M and not moving and kind in ("waiting", "turning in place"):
         return f"{kind}: at the goal"
     if kind == "waiting":
-        return f"waiting: {moving}" if moving else f"waiting: no way on, {room:.2f} m of room"
+        return f"waiting: {moving}" if moving else f"waiting: blocked ahead, {room:.2f} m of room"
     if kind == "going round":
-        return f"going round: {moving or f'something {room:.2f} m away'}"
+        return f"going round: {moving or f'an obstacle {room:.2f} m away'}"
     if kind == "backing out" and follows and not moving:
         return f"backing: the path leads back, {left:.1f} m to go"
     if kind == "backing out":
-        return f"backing out: {moving or f'no way on ahead, {room:.2f} m of room'}"
+        return f"backing out: {moving or f'blocked ahead, {room:.2f} m of room'}"
     if kind == "turning in place":
-        return "turning in place: the way on is to the side"
+        return "turning in place: the path leads to the side"
     return f"going: {left:.1f} m to go"
 
 
@@ -67,7 +67,7 @@ def _nearest_moving(track: Floats, discs: Floats) -> str:
     side = math.remainder(math.atan2(dy, dx) - track[0, 2], math.tau)
     where = _side(side)
     speed = float(np.hypot(*discs[nearest, 2:4]))
-    return f"somebody at {speed:.1f} m/s {max(0.0, float(away[nearest])):.1f} m {where}"
+    return f"a moving obstacle at {speed:.1f} m/s {max(0.0, float(away[nearest])):.1f} m {where}"
 
 
 def _side(bearing: float) -> str:

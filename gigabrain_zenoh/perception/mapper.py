@@ -62,7 +62,7 @@ def chart_of(config: PerceptionConfig, in_time: InTime = done) -> RobotMap:
             raise ConfigError("perception: map: expected a saved map, as mapping is 'localize'")
         saved = map_file.load(path)
         if problem := map_file.map_problem(saved):
-            raise ConfigError(f"{path}: {problem}; expected one to find the way in")
+            raise ConfigError(f"{path}: {problem}; expected a map to localize in")
         return StaticMap(saved, in_time=in_time)
     from gigabrain_zenoh.mapping.slam_map import SlamMap  # imports gtsam: for slam only
 

@@ -24,7 +24,7 @@ LOST_TICKS = round(LOST_S * 1e9 / TICK_NS)
 MAX_HINT_TICKS = round(2e9 / TICK_NS)  # age at which a hint expires
 PERSON_M, PERSON_RAD = 0.3, 0.25  # standard deviations of a hint by a person
 MIN_VARIANCE = 1e-6  # [m2], [rad2]
-PERSON_REASON = "a person has said where it is"
+PERSON_REASON = "a person has set its pose"
 
 
 class PoseHints:
@@ -89,7 +89,7 @@ class PoseHints:
         yaw = 0.0 if request.yaw is None else math.remainder(request.yaw, math.tau)
         covariance = _covariance(request)
         if covariance is None:
-            return PoseReply(ok=False, text="the covariance is none: it has negative eigenvalues")
+            return PoseReply(ok=False, text="invalid covariance: it has negative eigenvalues")
         self._lose(PERSON_REASON)
         self._hint = PoseHint(np.array((request.x, request.y, yaw)), covariance)
         self._sample, self._by_person = moment, True

@@ -86,7 +86,7 @@ class SolidPublisher:
             problem = str(error)
         else:
             return
-        text = f"things near the arm are not looked for: {problem}"
+        text = f"things near the arm are not detected: {problem}"
         log.warning("%s", text, extra={"data": {"event": "solids"}})
 
     def _on_detections(self, found: Detections) -> None:

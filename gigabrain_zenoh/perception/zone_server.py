@@ -170,8 +170,8 @@ class ZoneServer:
         """Return the cause if zones cannot be saved."""
         if not self.problem:
             return ()
-        remedy = "make room on the disk, and see that the folder can be written"
-        text = f"zones are not saved, and would be lost with perception: {self.problem}"[:500]
+        remedy = "make room on the disk, and check that the folder is writable"
+        text = f"zones are not saved; they are lost if perception ends: {self.problem}"[:500]
         return (Cause(code="zones_unsaved", text=text, remedy=remedy),)
 
     def _update(self) -> None:
@@ -218,7 +218,7 @@ class ZoneServer:
         else:
             if exists and not request.replace:
                 remedy = "replace it (--replace), or choose another name"
-                raise Refused(f"{name!r} is there already; {remedy}")
+                raise Refused(f"{name!r} exists already; {remedy}")
             if request.zone and (problem := zone_file.new_zone_problem(request.zone)):
                 raise Refused(f"zone {name!r}: {problem}")
             items = (*others, _anchored(new, self._poses))

@@ -317,7 +317,7 @@ async def test_a_hanging_disk_is_reported_after_30_s_and_delays_nothing(
         robot.drive(11)
         assert robot.bus.problems == ()
     assert [problem.code for problem in problems] == ["map_unsaved"]
-    assert "map_0.npz: the disk does not take it" in problems[0].text
+    assert "map_0.npz: saving takes too long" in problems[0].text
 
 
 async def test_a_map_can_be_loaded_and_extended_without_a_state_folder(

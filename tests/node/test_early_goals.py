@@ -67,7 +67,7 @@ async def test_a_goal_in_a_wall_accepted_before_the_first_map_fails_with_the_rea
         assert (await plane.ask_at_once(GOAL, GoalRequest(x=2.6, y=0.5))).ok
         await plane.until("failed", seconds=2)
         reason = plane.status.done[0].reason
-        assert reason.startswith("the goal is inside something; nearest reachable point is ")
+        assert reason.startswith("the goal is inside an obstacle; nearest reachable point is ")
         assert plane.travelled == 0.0
 
 

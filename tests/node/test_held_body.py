@@ -53,7 +53,7 @@ def script(plane: Held) -> None:
     [
         (operator, OPERATOR_HOLDS),
         (pressed, "the gate is latched: e-stop pressed by ann"),
-        (script, "script-7 has the body"),
+        (script, "script-7 drives"),
     ],
 )
 async def test_a_goal_waits_with_a_reason_while_the_body_is_held(

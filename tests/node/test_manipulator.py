@@ -181,7 +181,7 @@ def test_an_impossible_command_fails_with_a_reason_and_without_motion(
 def test_a_pick_of_a_missing_thing_fails_after_three_tries(tmp_path: Path) -> None:
     rig = Rig(tmp_path, cube=(-0.3, 0.3))
     task = rig.run_mission(THINGS + "do: [{pick: cube}]")
-    assert (task.state, task.reason) == ("failed", "picking up cube: it was not caught, 3 times")
+    assert (task.state, task.reason) == ("failed", "picking up cube: the gripper missed it 3 times")
     assert rig.phases.count("close") == 3
     rig.manipulator.close()
 
@@ -305,7 +305,7 @@ def test_a_gripper_that_is_still_closing_does_not_count_as_holding(tmp_path: Pat
         assert rig.outcome.reason == "close"
     rig.arm.state = true_state  # type: ignore[method-assign]
     task = rig.run_until_done()
-    assert (task.state, task.reason) == ("failed", "picking up cube: it was not caught, 3 times")
+    assert (task.state, task.reason) == ("failed", "picking up cube: the gripper missed it 3 times")
     rig.manipulator.close()
 
 
@@ -384,7 +384,7 @@ def test_a_gripper_slowed_by_safety_does_not_count_as_holding(
 ) -> None:
     rig.arm.caps = (JointCap(name="gripper", fall=0.02),)
     task = rig.run_mission(THINGS + "do: [{pick: cube}]")
-    assert (task.state, task.reason) == ("failed", "picking up cube: it was not caught, 3 times")
+    assert (task.state, task.reason) == ("failed", "picking up cube: the gripper missed it 3 times")
     assert rig.phases.count("close") == 3
 
 

@@ -33,7 +33,7 @@ def own_maps(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 async def test_a_map_is_saved_and_the_robot_is_localized_in_it(own_maps: Path) -> None:
     async with Robot() as robot:
         robot.publish_body()
-        assert (await robot.save("early")).text.startswith("not saved: where the robot is")
+        assert (await robot.save("early")).text.startswith("not saved: the robot is not localized")
         robot.drive(80)
         reply = await robot.save("house")
         assert reply.ok, reply.text
@@ -51,7 +51,7 @@ async def test_a_map_is_saved_and_the_robot_is_localized_in_it(own_maps: Path) -
     assert pose.localized
     assert (pose.x, pose.y) == pytest.approx((0.0, 0.0), abs=0.05)
     assert grid.resolution == 0.05
-    assert reply.text == "not saved: perception finds its way in a saved map, it makes none"
+    assert reply.text == "not saved: perception only localizes in a saved map; set mapping: slam"
 
 
 async def test_zones_are_saved_in_the_frame_of_the_saved_map(

@@ -47,9 +47,9 @@ async def test_it_drives_round_a_wall_to_its_goal_and_reports_its_progress() -> 
 @pytest.mark.parametrize(
     ("x", "y", "why"),
     [
-        (2.6, 0.5, "the goal is inside something; nearest reachable point is "),
+        (2.6, 0.5, "the goal is inside an obstacle; nearest reachable point is "),
         (50.0, 1.0, "the goal is outside the map; nearest reachable point is "),
-        (4.7, 1.0, "the goal is too close to something: the body needs "),
+        (4.7, 1.0, "the goal is too close to an obstacle: the body needs "),
     ],
 )
 async def test_an_unreachable_goal_is_refused_with_the_reason(x: float, y: float, why: str) -> None:
@@ -69,7 +69,7 @@ async def test_a_goal_behind_a_closed_wall_is_refused_with_the_nearest_point() -
         await plane.go(0.2)
         reply = await plane.ask(GOAL, GoalRequest(x=4.0, y=0.8))
         assert not reply.ok
-        assert reply.text.startswith("no way leads to the goal; nearest reachable point is ")
+        assert reply.text.startswith("no path leads to the goal; nearest reachable point is ")
 
 
 @pytest.mark.parametrize(
@@ -77,7 +77,7 @@ async def test_a_goal_behind_a_closed_wall_is_refused_with_the_nearest_point() -
     [
         ("allow", "goal-1: on the way, "),
         ("avoid", "goal-1: on the way, "),
-        ("forbid", "no way leads to the goal; nearest reachable point is "),
+        ("forbid", "no path leads to the goal; nearest reachable point is "),
     ],
 )
 async def test_a_setting_allows_or_forbids_routes_through_unknown_space(
@@ -179,7 +179,7 @@ async def test_a_goal_found_too_close_to_an_obstacle_is_reached_beside_it() -> N
         plane.cells[:, 83:86] = 100  # a new wall at x = 4.15 m, too close to the goal
         await plane.until("succeeded", seconds=90)
         reason = plane.status.done[0].reason
-        assert " m from the requested goal: the goal is too close to something" in reason
+        assert " m from the requested goal: the goal is too close to an obstacle" in reason
         assert 0.1 < math.hypot(plane.x - 4.0, plane.y - 1.6) < 0.4
         assert plane.closest > 0.1
 
@@ -223,4 +223,5 @@ async def test_it_gives_way_to_a_person_who_arrived_before_the_goal() -> None:
         await plane.go(4.0)  # the person stands now
         assert (await plane.ask(GOAL, GoalRequest(x=4.0, y=0.8))).ok
         await plane.go(14.0)
-        assert "somebody is in the way" in "\n".join(one.reason for one in plane.intents)
+        reasons = "\n".join(one.reason for one in plane.intents)
+        assert "a person or a moving obstacle is in the way" in reasons

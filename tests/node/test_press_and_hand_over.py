@@ -113,7 +113,7 @@ def offering(tmp_path: Path) -> Any:
     rig = Rig(tmp_path)
     rig.add_mission(THINGS + "do: [{pick: cube}, {hand_over: {seconds: 8}}]")
     while rig.phases[-1:] != [
-        "waiting for somebody to pull at cube; `gigabrain task resume` lets go of it"
+        "waiting for a person to pull at cube; `gigabrain task resume` opens the gripper"
     ]:
         rig.tick()
         assert rig.queue.status.current, rig.queue.status.done
@@ -153,7 +153,7 @@ def test_a_thing_taken_from_the_gripper_counts_as_handed_over(offering: Rig) -> 
 
 
 def test_the_gripper_lets_go_on_request(offering: Rig) -> None:
-    assert offering.queue.resume("") == "mission-1 lets go of it"
+    assert offering.queue.resume("") == "mission-1 opens the gripper"
     assert offering.run_until_done().state == "succeeded"
     assert has_let_go(offering)
     with pytest.raises(Refused):
@@ -163,5 +163,5 @@ def test_the_gripper_lets_go_on_request(offering: Rig) -> None:
 def test_a_thing_that_nobody_takes_is_kept_and_the_step_fails(offering: Rig) -> None:
     task = offering.run_until_done()
     assert task.state == "failed"
-    assert task.reason == "nobody took cube within 8 s; the gripper holds it still"
+    assert task.reason == "nobody took cube within 8 s; the gripper still holds it"
     assert offering.arm.thing()[2] > 0.12

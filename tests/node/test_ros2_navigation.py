@@ -191,7 +191,7 @@ async def test_a_new_goal_ends_the_previous_task_even_if_it_is_refused():
     await brain.located()
     old = brain.begin()
     await brain.settle()
-    brain.refusal = "no way leads there"
+    brain.refusal = "no path leads there"
     new = brain.begin()
     old.cancel()
     assert (await new).state is EndState.ABORTED
@@ -245,9 +245,9 @@ async def test_a_refused_goal_has_the_code_of_the_planner(codes, here, goal, gri
         await brain.located(*here, grid)
     elif grid:
         brain.bus.publish(MAP, grid)
-    brain.refusal = "no way leads to the goal"
+    brain.refusal = "no path leads to the goal"
     found = await brain.begin((Pose(x=goal[0], y=goal[1], yaw=0.0),), codes)
-    assert found == Outcome(EndState.ABORTED, code, "no way leads to the goal")
+    assert found == Outcome(EndState.ABORTED, code, "no path leads to the goal")
 
 
 def test_the_largest_circle_in_a_footprint_touches_its_nearest_side():
@@ -377,7 +377,7 @@ async def test_an_invalid_goal_is_aborted_and_does_not_end_the_present_one():
 
 async def test_a_goal_without_a_path_is_aborted_with_the_planners_code():
     async with client() as ros:
-        ros.brain.refusal = "no way leads to the goal"
+        ros.brain.refusal = "no path leads to the goal"
         await ros.send(1, ros_goal(x=99.0))
         assert await ros.result(1) == (6, 204)
 

@@ -94,7 +94,7 @@ async def test_it_drives_to_a_known_can_and_faces_it() -> None:
         distance, turn = plane.distance_and_bearing(2.8, 1.2)
         assert 0.25 < distance < 0.5
         assert turn < 0.25
-        assert plane.status.done[0].reason.endswith("before can 3")
+        assert plane.status.done[0].reason.endswith("in front of can 3")
 
 
 async def test_it_searches_the_next_room_for_a_can() -> None:
@@ -113,7 +113,7 @@ async def test_a_search_fails_after_looking_everywhere() -> None:
         request = MissionRequest(mission="do: [{find: can}]")
         assert (await plane.ask(MISSION, request)).ok
         await plane.until("failed", seconds=400)
-        reason = "a can was not found: everything reachable was looked at"
+        reason = "a can was not found: everything reachable was seen"
         assert plane.status.done[0].reason == reason
         assert plane.travelled > 3.0
 
@@ -136,7 +136,7 @@ async def test_a_can_moved_during_the_drive_is_searched_elsewhere() -> None:
         await plane.go(2.0)
         plane.things = [map_object(4, 1.0, 2.5)]
         await plane.until("succeeded", seconds=120)
-        assert plane.status.done[0].reason.endswith("before can 4")
+        assert plane.status.done[0].reason.endswith("in front of can 4")
 
 
 async def test_it_stands_with_a_reason_without_recognition() -> None:
@@ -168,7 +168,7 @@ async def test_a_search_with_only_a_camera_on_the_arm_is_refused() -> None:
         await plane.go(0.5)
         reply = await plane.ask(GOAL, GoalRequest(object="can"))
         assert not reply.ok
-        assert reply.text.startswith("the robot has no camera but on its arm; ")
+        assert reply.text.startswith("the robot has a camera on its arm only; ")
 
 
 async def test_an_object_name_given_as_place_is_refused_with_the_right_command() -> None:

@@ -32,7 +32,7 @@ async def test_a_start_mission_waits_for_the_places_of_the_map(tmp_path: Path) -
     async with plane_with_mission(tmp_path, "do: [{goto: kitchen}]") as plane:
         await plane.go(0.5)
         assert plane.intent.reason == (
-            "waiting: for the body and the map's places, to begin its mission"
+            "waiting: the mission needs the body and the map's places first"
         )
         send_places(plane, "kitchen")
         await plane.until("succeeded", seconds=60)

@@ -87,7 +87,7 @@ async def test_a_goal_behind_zones_is_refused_with_the_zone_in_the_way() -> None
         reply = await plane.ask(GOAL, GoalRequest(x=7.0, y=3.0))
         assert not reply.ok
         assert reply.text.startswith(
-            "no way leads to the goal without entering keep-out zone 'wall'; nearest reachable"
+            "no path leads to the goal without entering keep-out zone 'wall'; nearest reachable"
         )
 
 

@@ -150,4 +150,4 @@ async def test_it_drives_to_cans_and_tags_and_lists_them(home: Home, tmp_path: P
         mission.write_text("do: [{find: umbrella}]")
         nowhere = home.start("mission", str(mission))
         assert await nowhere.ended(600.0) == 1
-        assert "an umbrella was not found: everything reachable was looked at" in nowhere.err
+        assert "an umbrella was not found: everything reachable was seen" in nowhere.err

@@ -169,7 +169,7 @@ def describe(action: ArmAction) -> str:
         case HandOver():
             return "handing over"
         case AwaitTaken():
-            return "waiting for somebody to take it"
+            return "waiting for a person to take it"
 
 
 def describe_point(point: Sequence[float]) -> str:

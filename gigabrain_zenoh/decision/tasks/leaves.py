@@ -119,7 +119,7 @@ class DriveNode(Leaf):
     ) -> None:
         doing = {"explore": "exploring", "visit": "visiting a place"}.get(kind)
         if target:
-            doing = f"going before {target.name}"
+            doing = f"going to {target.name}"
         super().__init__(doing or f"going to {place or (goal and describe_goal(goal))}", context)
         self._command = DriveCommand(0, kind, goal, target)
         self._prefix = f"{place}: " if place else ""
@@ -204,7 +204,7 @@ class OfferNode(ArmNode):
             held = self.context.hand.held
             name = held.name if isinstance(held, HeldThing) else "it"
             return self.failed(
-                f"nobody took {name} within {self._seconds:g} s; the gripper holds it still"
+                f"nobody took {name} within {self._seconds:g} s; the gripper still holds it"
             )
         self.context.offers = True
         return Status.RUNNING
@@ -246,7 +246,7 @@ class SeekNode(Leaf):
             self._tried.append(self._command.target)
         self._choose(found)
         target = self._command.target
-        self.context.doing = f"going before {target.name}" if target else self.name
+        self.context.doing = f"going to {target.name}" if target else self.name
         if target is None and not found.recognizing:
             self.context.doing = NOBODY_LOOKS
         else:

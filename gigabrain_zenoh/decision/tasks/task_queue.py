@@ -180,7 +180,7 @@ class TaskQueue:
         job = self._job(name)
         if not job.held and job is self._jobs[0] and job.context.offers:
             job.context.may_let_go = True
-            return f"{job.id} lets go of it"
+            return f"{job.id} opens the gripper"
         if not job.held and job is not self._jobs[0]:
             raise Refused(f"{job.id} waits for {self._jobs[0].id}; it goes on by itself after that")
         if not job.held:
@@ -346,5 +346,5 @@ class TaskFile:
         try:
             path.replace(bad)
         except OSError as problem:
-            return f"{path} is damaged ({error}) and stays: {problem.strerror}"
+            return f"{path} is damaged ({error}) and cannot be renamed: {problem.strerror}"
         return f"{path} is damaged ({error}); renamed to {bad}, no tasks restored"

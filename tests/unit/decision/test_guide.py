@@ -75,7 +75,7 @@ def test_a_path_that_the_map_closes_is_followed_for_30_s() -> None:
         assert np.array_equal(kept.points, first.points)
     lost = think(guide, SHUT, tick=1502, x=2.5)
     assert (lost.state, lost.points) == ("failed", None)
-    assert lost.reason.startswith("no way leads to the goal; nearest reachable point is ")
+    assert lost.reason.startswith("no path leads to the goal; nearest reachable point is ")
 
 
 def test_a_path_blocked_by_a_person_at_first_has_30_s_to_open() -> None:
@@ -178,10 +178,10 @@ def test_it_gives_up_with_the_known_reason() -> None:
         assert route.state == "failed"
         return route.reason
 
-    doing = RouteFeedback(version=1, reason="waiting: no way on, 0.02 m of room")
+    doing = RouteFeedback(version=1, reason="waiting: blocked ahead, 0.02 m of room")
     gave_up = "gave up: no progress for 30 s, 3.00 m from the goal"
     assert ended() == gave_up
-    assert ended(feedback=doing) == f"{gave_up} (waiting: no way on, 0.02 m of room)"
+    assert ended(feedback=doing) == f"{gave_up} (waiting: blocked ahead, 0.02 m of room)"
     near = "obstacle 0.14 m ahead of the body"
     assert ended(feedback=doing, slowed_by=near) == f"{gave_up} ({near})"
 
@@ -245,7 +245,7 @@ def test_it_gives_way_twice_to_an_obstacle_that_stays_at_the_goal_and_then_fails
     assert math.hypot(routes[4].goal.x - 5.0, routes[4].goal.y - 3.0) > 4.0  # now far away
     told = ask(TAKEN, tick=4004)
     assert told.state == "failed"
-    assert told.reason.startswith("the goal is inside something; nearest reachable point is ")
+    assert told.reason.startswith("the goal is inside an obstacle; nearest reachable point is ")
 
 
 def test_it_returns_after_giving_way_to_check_if_the_goal_is_free() -> None:
@@ -257,7 +257,7 @@ def test_it_returns_after_giving_way_to_check_if_the_goal_is_free() -> None:
     ask(TAKEN, tick=502, x=4.0, y=3.0)
     looks = ask(TAKEN, tick=1252, x=1.0, y=1.0)
     assert looks.activity == "checking whether the goal is free"
-    assert looks.reason == "the goal is inside something"
+    assert looks.reason == "the goal is inside an obstacle"
     assert looks.goal
     assert looks.points is not None
     assert looks.activity  # the command is not done there
@@ -316,7 +316,8 @@ def goes_aside(cells: np.ndarray, walkers: np.ndarray, seen: np.ndarray) -> list
 def test_it_moves_aside_for_a_person_in_the_only_door(cells: np.ndarray) -> None:
     *waits, leaves, stays = goes_aside(cells, THERE, HITS)
     assert [one.activity for one in waits] == ["", ""]
-    assert (leaves.activity, leaves.reason) == ("giving way", "somebody is in the way")
+    assert leaves.activity == "giving way"
+    assert leaves.reason == "a person or a moving obstacle is in the way"
     assert leaves.goal
     assert abs(leaves.goal.y - 3.0) >= 1.0  # beside the line of the person, not of the robot
     assert math.dist((leaves.goal.x, leaves.goal.y), (3.2, 3.2)) < 1.2

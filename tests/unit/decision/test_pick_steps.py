@@ -63,8 +63,8 @@ def test_it_drives_four_times_and_then_fails_with_the_reason() -> None:
 def test_a_failed_approach_is_the_reason_of_the_failure() -> None:
     steps = Steps()
     steps.answer(**FAR)
-    steps.answer(state="failed", reason="no free and reachable place before can")
-    assert steps.queue.status.done[0].reason == "no free and reachable place before can"
+    steps.answer(state="failed", reason="no free and reachable place in front of can")
+    assert steps.queue.status.done[0].reason == "no free and reachable place in front of can"
 
 
 def test_it_searches_for_an_unseen_thing_and_picks_it_up() -> None:

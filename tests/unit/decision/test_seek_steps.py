@@ -46,7 +46,7 @@ def test_it_looks_for_an_object_and_drives_to_the_nearest_once_it_is_known() -> 
     assert robot.status.doing == "looking for a can"
     robot.knows(can(4, 5.0), can(9, 2.0), can(1, 0.1, label="ball"))
     assert robot.wanted() == ("approach", "can 9")
-    assert robot.status.doing == "going before can 9"
+    assert robot.status.doing == "going to can 9"
     robot.knows(can(4, 0.5), can(9, 2.04))  # it keeps its target
     number = robot.command.number if robot.command else 0
     assert robot.wanted() == ("approach", "can 9")
@@ -80,7 +80,7 @@ def test_an_object_lost_on_the_way_is_sought_at_its_last_place() -> None:
     robot.knows(can(3, 3.0))
     assert robot.wanted() == ("approach", "can 3")
     robot.knows()
-    robot.failed("no free and reachable place before can 3")
+    robot.failed("no free and reachable place in front of can 3")
     assert robot.wanted() == ("look", "")
 
 
@@ -111,10 +111,10 @@ def test_it_fails_with_a_reason_once_everything_was_looked_at() -> None:
     robot = Seeker()
     robot.carry_out("do: [{find: umbrella}]")
     assert robot.wanted() == ("look", "")
-    robot.failed("everything reachable was looked at")
+    robot.failed("everything reachable was seen")
     assert robot.last == (
         "failed",
-        "an umbrella was not found: everything reachable was looked at",
+        "an umbrella was not found: everything reachable was seen",
     )
 
 
@@ -123,14 +123,15 @@ def test_of_two_things_the_one_that_can_be_reached_will_do() -> None:
     robot.carry_out("do: [{find: can}]")
     robot.knows(can(1, 1.0), can(2, 2.0))
     assert robot.wanted() == ("approach", "can 1")
-    robot.failed("no free and reachable place before can 1")
+    robot.failed("no free and reachable place in front of can 1")
     assert robot.wanted() == ("approach", "can 2")
-    robot.failed("no free and reachable place before can 2")
+    robot.failed("no free and reachable place in front of can 2")
     assert robot.wanted() == ("look", "")
-    robot.failed("everything reachable was looked at")
+    robot.failed("everything reachable was seen")
     assert robot.last[1] == (
-        "no free and reachable place before can 1; no free and reachable place before can 2; "
-        "a can was not found: everything reachable was looked at"
+        "no free and reachable place in front of can 1; "
+        "no free and reachable place in front of can 2; "
+        "a can was not found: everything reachable was seen"
     )
 
 

@@ -139,7 +139,7 @@ def seen_by(poses: list[Pose], cells: np.ndarray, *, close: bool = False) -> flo
 
 def test_it_looks_at_a_whole_room_and_then_fails() -> None:
     poses, reason = search(ROOM)
-    assert reason == "everything reachable was looked at"
+    assert reason == "everything reachable was seen"
     assert seen_by(poses, ROOM) > 0.9
     assert len(poses) < 110  # viewpoints, including those at the edges of the map
 
@@ -170,7 +170,7 @@ def test_it_looks_into_each_room_of_a_flat() -> None:
     cells[:25, 40] = 100
     cells[35:, 40] = 100  # a wall with a door
     poses, reason = search(cells)
-    assert reason == "everything reachable was looked at"
+    assert reason == "everything reachable was seen"
     assert seen_by(poses, cells) > 0.9
 
 
@@ -178,7 +178,7 @@ def test_a_search_ends_although_a_room_is_unreachable() -> None:
     cells = empty(8.0, 4.0)
     cells[:, 40] = 100
     poses, reason = search(cells)
-    assert reason == "everything reachable was looked at"
+    assert reason == "everything reachable was seen"
     assert max(pose.x for pose in poses) < 4.0
 
 
@@ -189,7 +189,7 @@ def test_a_room_whose_door_was_blocked_by_a_person_is_searched_too() -> None:
     opened = cells.copy()
     opened[10:25, 40] = 0
     poses, reason = search(cells, opened)
-    assert reason == "everything reachable was looked at"
+    assert reason == "everything reachable was seen"
     assert max(pose.x for pose in poses) > 4.5
 
 
@@ -200,7 +200,7 @@ def test_it_also_waits_for_a_second_door_blocked_by_a_person() -> None:
     first, second = cells.copy(), cells.copy()
     first[10:25, 40] = second[10:25, 40] = second[10:25, 60] = 0
     poses, reason = search(cells, first, second)
-    assert reason == "everything reachable was looked at"
+    assert reason == "everything reachable was seen"
     assert max(pose.x for pose in poses) > 6.5
 
 
@@ -223,9 +223,9 @@ def test_it_retries_to_reach_unexplored_space_and_then_ends() -> None:
             planner._drop_frontier(tick)
         if route.state != "running":
             break
-    assert told.count(again := "trying again to get to unexplored space") == 2
+    assert told.count(again := "trying again to reach unexplored space") == 2
     assert all(told[k + 1] == "way" for k, one in enumerate(told) if one == again)
-    assert route.reason == "everything reachable was looked at"
+    assert route.reason == "everything reachable was seen"
 
 
 @pytest.mark.long
@@ -268,7 +268,7 @@ def test_a_search_blocked_by_a_person_moves_aside() -> None:
     assert away.goal
     assert abs(away.goal.x - 1.6) >= 1.0
     assert told.count("giving way") >= 30  # twice for 15 s
-    assert routes[-1].reason == "everything reachable was looked at"
+    assert routes[-1].reason == "everything reachable was seen"
 
 
 def test_it_waits_aside_for_a_person_in_front_of_an_object() -> None:

@@ -77,7 +77,9 @@ async def test_the_status_is_published_at_5_hz_of_the_robots_time(site: Site) ->
 async def test_a_goal_that_cannot_be_reached_is_refused_and_changes_nothing(site: Site) -> None:
     await site.step()
     await site.go(3.0)
-    site.wall = "the goal is inside something; nearest reachable point is 0.4 m away at (1.2, 0.3)"
+    site.wall = (
+        "the goal is inside an obstacle; nearest reachable point is 0.4 m away at (1.2, 0.3)"
+    )
     assert await site.go(4.0) == GoalReply(ok=False, text=site.wall)
     await site.step()
     assert site.command
@@ -241,7 +243,7 @@ async def test_a_request_is_refused_if_another_map_is_loaded_meanwhile(
     goal = await site.go(3.0)
     assert goal.ok == ok
     if not ok:
-        assert goal.text == "another map was loaded meanwhile; send it again for this one"
+        assert goal.text == "another map was loaded meanwhile; send the goal again for this map"
         assert not (await site.carry_out("do: [{goto: [3, 0]}]")).ok
         await site.step()
         assert site.command is None

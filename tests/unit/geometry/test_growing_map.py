@@ -65,7 +65,7 @@ def test_a_robot_that_is_carried_away_is_relocalized_and_the_map_stays_intact() 
     walker.pose = at(6.0, 4.5, 100)
     chart.lose("the odometry has jumped")
     assert not walker.look().localized
-    with pytest.raises(Refused, match="where the robot is, is not known"):
+    with pytest.raises(Refused, match="not saved: the robot is not localized"):
         chart.to_save()
     place = walker.look(20)
     assert place.localized
@@ -83,7 +83,7 @@ def test_a_move_that_odometry_misses_is_detected_after_3_scans() -> None:
     before = chart.to_save()[0]
     walker.pose = at(6.0, 4.5, 100)
     assert [walker.look().localized for _ in range(3)] == [True, True, False]
-    with pytest.raises(Refused, match="what is seen is not where the robot was thought to be"):
+    with pytest.raises(Refused, match="the scans do not fit the robot's place in the map"):
         chart.to_save()
     assert chart.grid().cells == before.cells.tobytes()
     place = walker.look(20)

@@ -292,7 +292,7 @@ def test_inconsistent_arrays_are_refused() -> None:
         Slam.thaw({**frozen, "poses": frozen["poses"][:-1]})
     with pytest.raises(ValueError, match="points, got"):
         Slam.thaw({**frozen, "points": frozen["points"][:-1]})
-    with pytest.raises(ValueError, match="link: joins keyframes that there are not, of 6"):
+    with pytest.raises(ValueError, match="link: joins keyframes that do not exist, of 6"):
         Slam.thaw({**frozen, "link_ends": frozen["link_ends"] - 1})
     with pytest.raises(ValueError, match="link: expected positive definite covariances"):
         Slam.thaw({**frozen, "link_covariance": np.zeros((6, 3, 3))})

@@ -190,7 +190,7 @@ def test_a_map_whose_optimiser_always_raises_grows_without_loops_and_reports_it(
     assert [(one.code, one.text) for one in chart.problems()] == [
         (
             "loops_open",
-            "loops are closed no more, the optimiser fails: "
+            "loops are no longer closed, as the optimiser fails: "
             "Indeterminate linear system detected near variable 7.",
         )
     ]

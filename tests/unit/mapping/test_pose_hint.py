@@ -76,7 +76,7 @@ def test_a_hint_selects_one_of_two_places_that_look_alike(x: float, corridor: Sa
         at(x, 0.7 if x < 8 else 2.3, 0.0 if x < 8 else 180.0),
     )
     place = robot.look(20)
-    assert place.why == "it could be in 2 places"
+    assert place.why == "2 places match the scans"
     robot.chart.suggest(PoseHint(robot.pose + at(0.2, 0.1, 8), HINT_COVARIANCE))
     place = robot.look(4)  # 0.4 s
     assert place.localized

@@ -98,7 +98,7 @@ def test_a_quick_body_looks_round_before_it_drives() -> None:
     first, last = planner.plan(request), planner.plan(replace(request, tick=129))
     for one in (first, last):
         assert (one.twist, one.kind) == (Velocity(), "waiting")
-        assert one.reason == "waiting: it looks round for what moves"
+        assert one.reason == "waiting: looking round for moving obstacles"
     assert planner.plan(replace(request, tick=130)).twist.linear_x > 0.0
     slow = LocalPlanner(WAFFLE, FEW)
     assert slow.plan(request).twist.linear_x > 0.0

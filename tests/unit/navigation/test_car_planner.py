@@ -122,8 +122,8 @@ def test_unreachable_goals_are_refused_with_the_reason() -> None:
     planner = PathPlanner()
     here = Pose(x=1.0, y=1.0, yaw=0.0)
     for goal, fault in (
-        (Goal(x=4.0, y=4.0, yaw=0.0), "no way leads to the goal"),
-        (Goal(x=2.2, y=2.5, yaw=0.0), "the goal is too close to something for this heading"),
+        (Goal(x=4.0, y=4.0, yaw=0.0), "no path leads to the goal"),
+        (Goal(x=2.2, y=2.5, yaw=0.0), "the goal is too close to an obstacle for this heading"),
         (Goal(x=9.0, y=4.0), "the goal is outside the map"),
     ):
         found = planner.plan(costs, CAR, here, goal)

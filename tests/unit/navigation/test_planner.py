@@ -89,8 +89,8 @@ def test_a_door_is_passed_if_the_body_fits(door: int, passes: bool) -> None:
 @pytest.mark.parametrize(
     ("goal", "why"),
     [
-        ((3.05, 2.05), "the goal is inside something"),
-        ((2.95, 2.05), "the goal is too close to something: the body needs 0.15 m"),
+        ((3.05, 2.05), "the goal is inside an obstacle"),
+        ((2.95, 2.05), "the goal is too close to an obstacle: the body needs 0.15 m"),
         ((6.35, 2.05), "the goal is outside the map"),
         ((-0.25, 2.05), "the goal is outside the map"),
     ],
@@ -108,14 +108,14 @@ def test_a_goal_where_the_body_does_not_fit_is_refused_with_the_nearest_place(
 def test_the_refusal_has_a_text() -> None:
     found = refused(seen(rooms()), (5.55, 2.05), (3.05, 2.05))
     assert found.reason == (
-        "the goal is inside something; nearest reachable point is 0.20 m away at (2.85, 2.05)"
+        "the goal is inside an obstacle; nearest reachable point is 0.20 m away at (2.85, 2.05)"
     )
 
 
 def test_without_a_path_the_nearest_point_is_on_this_side() -> None:
     found = refused(seen(rooms(door=0)), (0.55, 1.05), (4.05, 1.05))
     assert found.reason == (
-        "no way leads to the goal; nearest reachable point is 1.20 m away at (2.85, 1.05)"
+        "no path leads to the goal; nearest reachable point is 1.20 m away at (2.85, 1.05)"
     )
     assert found.nearest == pytest.approx((2.85, 1.05))
 
@@ -141,7 +141,7 @@ def test_an_enclosed_robot_gets_the_reason() -> None:
     cells[15, 15] = 0
     found = refused(seen(cells), (1.55, 1.55), (0.5, 0.5))
     assert found.reason == (
-        "no way leads to the goal; the robot has no room to leave where it stands"
+        "no path leads to the goal; the robot has no room to move from its place"
     )
     assert found.nearest is None
 

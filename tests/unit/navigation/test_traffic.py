@@ -147,12 +147,12 @@ def looks(discs: tuple[Obstacle, ...], seconds: float) -> LocalPlan:
 def test_in_traffic_it_looks_longer_and_makes_way() -> None:
     far = Obstacle(id=1, x=6.0, y=0.0, velocity_y=1.5, radius=0.5)
     coming = Obstacle(id=2, x=3.0, y=0.0, velocity_x=-1.5, radius=0.5)
-    wait = "waiting: it looks round for what moves"
+    wait = "waiting: looking round for moving obstacles"
     assert looks((), 1.0).reason != wait
     assert looks((far,), 1.0).reason == wait
     assert looks((far,), dynamic_obstacles.LOOK_AROUND_IN_TRAFFIC_S).reason != wait
     makes_way = looks((far, coming), 1.0)
-    assert makes_way.reason == "making way: it looks round for what moves"
+    assert makes_way.reason == "making way: looking round for moving obstacles"
     assert math.hypot(makes_way.trajectory[-1].x, makes_way.trajectory[-1].y) < 3.0
 
 

@@ -90,7 +90,7 @@ def test_a_log_without_a_place_passed_twice_is_refused() -> None:
     [
         ({"ref": None}, "no ref; expected ranges, ref, odom"),
         ({"ref": np.zeros((4, 3))}, r"ref: expected poses of shape \(5, 3\)"),
-        ({"odom": np.full((5, 3), np.nan)}, "odom holds something else than numbers"),
+        ({"odom": np.full((5, 3), np.nan)}, "odom holds data other than numbers"),
         ({"ranges": np.zeros(5, np.uint16)}, "ranges: expected whole centimetres"),
         ({"ranges": np.zeros((5, 180))}, "ranges: expected whole centimetres"),
     ],
