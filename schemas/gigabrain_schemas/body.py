@@ -367,8 +367,8 @@ class BodyDescription(Record, frozen=True, kw_only=True, cache_hash=True):
             off = getattr(self.thresholds, name)
             if off > max(speed, getattr(DEFAULT, name)):
                 raise ValueError(
-                    f"thresholds: {name}: it is never so far off as {off:g}, "
-                    f"for its largest speed is {speed:g}"
+                    f"thresholds: {name}: its error never reaches {off:g}, "
+                    f"as its largest speed is {speed:g}; lower it"
                 )
         if len({camera.name for camera in self.cameras}) < len(self.cameras):
             raise ValueError("cameras: each needs a name of its own")

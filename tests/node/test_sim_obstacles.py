@@ -118,7 +118,7 @@ def test_obstacles_get_numbered_unique_names() -> None:
     assert sim.things.add(Thing(x=2)).name == "box1"
     with pytest.raises(Refused, match="there is a 'box2' already"):
         sim.things.add(Thing(x=2, name="box2"))
-    with pytest.raises(Refused, match="nothing called 'bix' was put in; there is: box2, box1"):
+    with pytest.raises(Refused, match="no object 'bix' was added; known: box2, box1"):
         sim.things.remove("bix")
 
 

@@ -443,7 +443,7 @@ async def run(config: DriverConfig, bus: Bus, ready: Callable[[], None]) -> None
     if not driver.can(robot.safe_state):
         known = ", ".join(name for name in get_args(SafeState) if driver.can(name))
         raise ConfigError(
-            f"safe_state: {robot.safe_state} is more than {type(driver).__name__} can do; "
+            f"safe_state: {robot.safe_state} is not supported by {type(driver).__name__}; "
             f"expected one of: {known}"
         )
     await wait_for_disk(Path(config.state_dir), bus.clock)

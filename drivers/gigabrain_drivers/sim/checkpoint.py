@@ -95,7 +95,7 @@ class CheckpointFiles:
         try:
             self.write(checkpoint)
         except OSError as error:
-            log.warning("the simulation will begin at its start after a crash: %s", error)
+            log.warning("the simulation will start from the beginning after a crash: %s", error)
             self._ended = True
             self.clear()
 

@@ -133,10 +133,10 @@ class MujocoDriver(Driver):
             try:
                 if checkpoint := files.read():
                     simulation = Simulation(body, world, seed, checkpoint)
-                    log.info("the simulation goes on at %.2f s", simulation.time_ns / 1e9)
+                    log.info("the simulation continues at %.2f s", simulation.time_ns / 1e9)
                     return simulation
             except (ConfigError, OSError) as error:
-                log.warning("the simulation begins at its start again: %s", error)
+                log.warning("the simulation starts from the beginning: %s", error)
                 files.clear()
         return Simulation(body, world, seed)
 

@@ -91,7 +91,7 @@ class LiveWorld:
             return f"{added.name} is at ({added.x:.2f}, {added.y:.2f})"
         if request.do == "remove":
             return f"{things.remove(request.name).name} is gone"
-        return f"{len(things.all())} things were put in"
+        return f"{len(things.all())} objects were added"
 
 
 def _answer(future: "asyncio.Future[SimReply]", reply: SimReply) -> None:

@@ -113,7 +113,7 @@ class Things:
         """Remove a thing. Raises Refused listing the existing ones."""
         if name not in self._used:
             known = ", ".join(self._used) or "none"
-            raise Refused(f"nothing called {name!r} was put in; there is: {known}")
+            raise Refused(f"no object {name!r} was added; known: {known}")
         used = self._used.pop(name)
         self._walk(used.body, None)
         self._hide(used.body)

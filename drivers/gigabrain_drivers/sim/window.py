@@ -23,8 +23,8 @@ ELSEWHERE = (
     "where there is a display, with --connect"
 )
 NO_SCENE = (
-    "this robot sends no simulated world; is it a simulation (`gigabrain demo`), and may your "
-    "keys look?"
+    "this robot sends no simulated world; is it a simulation (`gigabrain demo`), and do your "
+    "keys permit it?"
 )
 
 

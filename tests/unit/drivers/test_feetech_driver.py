@@ -216,7 +216,10 @@ async def test_a_servo_that_answers_no_more_is_named_and_the_others_hold() -> No
     async with opened(rig):
         rig.arm.bus.servos.remove(rig.servo("wrist_flex"))
         await rig.go(300, shoulder_pan=1.0)
-        assert rig.driver.problem == "servo 4 (wrist_flex) answers no more: cable, power?"
+        assert (
+            rig.driver.problem
+            == "servo 4 (wrist_flex) no longer answers: check its cable and power"
+        )
         assert not (await rig.driver.read_state()).link.connected
         at = rig.joint("shoulder_pan").position
         await rig.go(500, shoulder_pan=1.5)
@@ -232,7 +235,10 @@ async def test_an_emulated_servo_that_is_silent_neither_hears_nor_answers() -> N
         rig.arm.silent_servo = 3
         goals = rig.arm.servos["elbow_flex"].goals
         await rig.wait(300)
-        assert rig.driver.problem == "servo 3 (elbow_flex) answers no more: cable, power?"
+        assert (
+            rig.driver.problem
+            == "servo 3 (elbow_flex) no longer answers: check its cable and power"
+        )
         assert rig.arm.servos["elbow_flex"].goals == goals
         rig.arm.silent_servo = 0
         await rig.wait(200)

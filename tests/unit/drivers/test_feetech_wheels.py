@@ -199,7 +199,10 @@ async def test_a_wheel_that_answers_no_more_stops_the_others() -> None:
         await rig.drive(300, 0.2, 0.0, 0.0)
         rig.arm.bus.servos.remove(rig.arm.wheels["back"])
         await rig.drive(300, 0.2, 0.0, 0.0)
-        assert rig.driver.problem == "servo 8 (wheel back) answers no more: cable, power?"
+        assert (
+            rig.driver.problem
+            == "servo 8 (wheel back) no longer answers: check its cable and power"
+        )
         assert rig.rolling.speeds["left"] == pytest.approx(0.0, abs=0.01)
         assert not (await rig.state()).link.connected
 

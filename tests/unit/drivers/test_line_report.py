@@ -283,7 +283,7 @@ async def test_a_body_is_lost_without_flags_that_it_repeated(
 
     assert (await state_after(500, 2.0, 0.0, 2.0, 0.0, every=period)).link.connected
     assert (await state_after(100)).link.connected is not lost
-    assert ("flags come no more" in caplog.text) is lost
+    assert ("flags no longer arrive" in caplog.text) is lost
     back = await state_after(1, 2.0)
     assert back.link.connected
     assert back.bumpers == (True,)

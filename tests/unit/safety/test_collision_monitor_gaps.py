@@ -194,7 +194,9 @@ def test_a_body_that_cannot_stop_within_its_lidars_range_is_refused() -> None:
 @pytest.mark.parametrize("name", ["follow_linear", "follow_angular"])
 def test_a_tolerance_that_hides_a_runaway_is_refused(name: str) -> None:
     whole = msgspec.to_builtins(BODY)
-    with pytest.raises(msgspec.ValidationError, match=rf"thresholds: {name}: it is never so far"):
+    with pytest.raises(
+        msgspec.ValidationError, match=rf"thresholds: {name}: its error never reaches"
+    ):
         msgspec.convert({**whole, "thresholds": {name: 100.0}}, BodyDescription)
 
 

@@ -36,7 +36,7 @@ from gigabrain_zenoh.logs import Fault
 
 log = logging.getLogger(__name__)
 
-NO_VALID_FRAME = "no valid frame comes: is this the right port?"
+NO_VALID_FRAME = "no valid frames arrive: is this the right port?"
 STATE_TIMEOUT_NS = 100_000_000  # the body counts as lost after this time without a state
 FLUSH_NS = 10_000_000  # pause for the last command, before the connection closes
 CLOCK_WRAP_MS = 1 << 32  # the firmware's clock wraps here

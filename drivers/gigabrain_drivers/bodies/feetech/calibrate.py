@@ -178,7 +178,9 @@ class Calibrator:
 
     async def _write(self, servo: int, register: Register, value: int) -> None:
         if not await self._bus.write(servo, register, value):
-            raise ConfigError(f"servo {servo} takes no value at {register.address}: cable, power?")
+            raise ConfigError(
+                f"servo {servo} accepts no value at {register.address}: check its cable and power"
+            )
 
     async def _memory(self, servo: int) -> ServoMemory:
         data = await self._bus.confirm(servo, 0, feetech.EEPROM_SIZE)
@@ -193,8 +195,8 @@ class Calibrator:
                 return now
             before = now
         raise ConfigError(
-            f"servo {servo} reports another position each time: hold the arm still, or is its "
-            "cable loose?"
+            f"servo {servo} reports another position each time: hold the arm still, and check "
+            "its cable"
         )
 
     async def _position(self, servo: int) -> int:
@@ -207,5 +209,5 @@ class Calibrator:
 
 def _answered(servo: int, data: bytes | None) -> bytes:
     if data is None:
-        raise ConfigError(f"servo {servo} answers no more: cable, power?")
+        raise ConfigError(f"servo {servo} no longer answers: check its cable and power")
     return data

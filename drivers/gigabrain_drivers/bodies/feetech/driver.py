@@ -206,7 +206,7 @@ class FeetechDriver(Driver):
         self._limp = True
         for joint in self._joints.values():
             if not await self._bus.write(joint.id, feetech.TORQUE, 0):
-                raise BodyLost(f"{joint} does not let go")
+                raise BodyLost(f"{joint} does not switch off")
 
     async def set_joint_positions(self, positions: Mapping[str, float]) -> Mapping[str, float]:
         """Move joints [rad]; return the sent positions, or the measured ones if it cannot send.
@@ -352,7 +352,7 @@ class FeetechDriver(Driver):
         address = feetech.ACCELERATION.address
         await self._bus.send(feetech.sync_write(address, {joint.id: settings}))
         caught = await self._bus.write(joint.id, feetech.TORQUE, 1)
-        text = "it holds again" if caught else "and could not be caught"
+        text = "it holds again" if caught else "and it could not be switched on again"
         raise BodyLost(f"{joint} had let go by itself, {text}: is its supply too weak?")
 
     async def _send_settings(self, now_ns: int) -> None:

@@ -185,7 +185,7 @@ class ServoJoint:
     def lost(self, now_ns: int) -> str:
         """Return a text if it no longer answers, else an empty one."""
         silent = now_ns - self.received_ns > self.lost_after_ns
-        return f"{self} answers no more: cable, power?" if silent else ""
+        return f"{self} no longer answers: check its cable and power" if silent else ""
 
     def measured(self) -> Joint | None:
         """Return its measured state, or None before the first reading."""

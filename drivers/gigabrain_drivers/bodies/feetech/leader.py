@@ -105,7 +105,9 @@ class LeaderArm:
                 await self._bus.write(joint.id, feetech.TORQUE, 0)
                 now = await self._arming.block(joint.id)
             if now is None or now.torque:
-                raise ConfigError(f"{self._link}: {joint} answers only at times: cable, power?")
+                raise ConfigError(
+                    f"{self._link}: {joint} answers only at times: check its cable and power"
+                )
             joint.begin(now, self._clock.now_ns())
 
     async def read(self) -> Mapping[str, float]:

@@ -130,7 +130,7 @@ class ServoWheel:
     def problem(self, now_ns: int) -> str:
         """Return its problem as one line, or an empty text."""
         if now_ns - self.received_ns > LOST_NS:
-            return f"{self} answers no more: cable, power?"
+            return f"{self} no longer answers: check its cable and power"
         if status := feetech.faults_of(self.status):
             return f"{self} protects itself: {status}"
         return ""

@@ -41,7 +41,7 @@ MIN_TIMEOUT_NS = 100_000_000  # but not before this time
 MAX_TIMEOUT_NS = 500_000_000  # of a slower line with a part of the velocity
 REPEAT_SHARE = 0.9  # commands repeat after this share of the period, because ticks are uneven
 NO_VALID_LINE = (
-    "no valid line comes, or one that is part of the velocity is missing: "
+    "no valid lines arrive, or the one with a part of the velocity is missing: "
     "check firmware, baud rate and wiring"
 )
 BUMPER = "bumper"  # part of the names of bumper flags
@@ -128,9 +128,11 @@ class LineDriver(Driver):
         report, now_ns = self._report, self._clock.now_ns()
         alive, overdue = self._liveness.alive(), report.flags_overdue(now_ns)
         if alive and overdue:
-            self._no_flags.begin(f"{self.link}: its flags come no more: check firmware and wiring")
+            self._no_flags.begin(
+                f"{self.link}: its flags no longer arrive: check firmware and wiring"
+            )
         elif alive:
-            self._no_flags.end(f"{self.link}: its flags come again")
+            self._no_flags.end(f"{self.link}: its flags arrive again")
         return RobotState(
             robot_type=self.robot.robot_type,
             pose=report.pose,
