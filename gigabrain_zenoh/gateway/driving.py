@@ -133,7 +133,7 @@ class RosCommander:
         if self._memory.refusal:
             self._refused.begin(f"refused /cmd_vel: {self._memory.refusal}", now_ns)
         else:
-            self._refused.end("/cmd_vel is obeyed, or silent", now_ns)
+            self._refused.end("/cmd_vel is accepted again, or silent", now_ns)
 
     async def _ask(self, *, take: bool) -> None:
         gate, text = None, ""
@@ -165,7 +165,7 @@ class PoseRequests:
     async def _initial_pose(self, message: Any) -> str:
         frame, guess = message.header.frame_id, message.pose
         if frame != MAP:
-            raise Refused(f"frame {frame[:60]!r} is not that of a first pose; expected {MAP}")
+            raise Refused(f"frame {frame[:60]!r} is not valid for an initial pose; expected {MAP}")
         at, covariance = planar(guess.pose), planar_covariance(guess.covariance)
         bus = self._scene.bus
         request = PoseRequest(x=at.x, y=at.y, yaw=at.yaw, covariance=covariance, source=bus.process)

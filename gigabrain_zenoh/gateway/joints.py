@@ -221,7 +221,7 @@ class JointCommander:
             causes = "; ".join(cause.text for cause in state.gate.causes)
             raise Refused(f"latched: {causes}; call the service release first")
         if state.limp:
-            raise Refused("its joints are let go of; hold them first: gigabrain arm hold")
+            raise Refused("its joints are limp; hold them first: gigabrain arm hold")
         for left in reversed(range(STOP_TICKS)):
             try:
                 reply = await enable(self._bus, self._name, take=self._take)

@@ -23,7 +23,7 @@ log = logging.getLogger(__name__)
 TRIGGER, SET_BOOL = "std_srvs/srv/Trigger", "std_srvs/srv/SetBool"
 LOG_NS = 1_000_000_000
 SAVE_S = 10.0  # timeout: a large map takes a second on a slow disk
-NOT_HERE = "an e-stop is not taken back here; look at the robot, then call the service release"
+NOT_HERE = "this service cannot undo an e-stop; check the robot, then call the service release"
 
 
 class Services:

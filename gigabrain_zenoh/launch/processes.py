@@ -75,8 +75,8 @@ NEEDS_NAMESPACE = (
     "or leave free_fleet off"
 )
 NO_ROS_IDENTITY = (
-    "ros2: nodes of ROS have no identity at a router with keys; name another one as "
-    "`router:`, or use `transport: dds`"
+    "ros2: ROS nodes have no keys for this router; name another router as `router:`, or use "
+    "`transport: dds`"
 )
 NEVER_RELAYED = {"router", "driver"}  # a relay would hide the loss of the router from the body
 

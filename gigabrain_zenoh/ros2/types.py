@@ -155,7 +155,7 @@ class Types:
 def decoded(store: Any, name: str, payload: bytes) -> Any:
     """Return the message in a payload, by a type store of rosbags. Raises only BadPayload."""
     if not 4 <= len(payload) <= MAX_PAYLOAD or payload[0] or payload[1] > 1:
-        raise BadPayload(f"{name}: no CDR: {len(payload)} bytes, {payload[:4].hex()}…")
+        raise BadPayload(f"{name}: not CDR: {len(payload)} bytes, {payload[:4].hex()}…")
     definition = store.get_msgdef(name)
     read = definition.deserialize_cdr_le if payload[1] else definition.deserialize_cdr_be
     try:

@@ -62,9 +62,9 @@ def planar(ros_pose: Any) -> Pose:
     x, y = float(ros_pose.position.x), float(ros_pose.position.y)
     yaw = yaw_of(ros_pose.orientation)
     if not (abs(x) <= MAX_COORDINATE and abs(y) <= MAX_COORDINATE):
-        raise Refused(f"the position ({x:g}, {y:g}) is none in a map; expected metres")
+        raise Refused(f"the position ({x:g}, {y:g}) is outside any map; expected metres")
     if yaw is None:
-        raise Refused("the orientation is no quaternion of length 1; expected w: 1.0 for straight")
+        raise Refused("the orientation is not a unit quaternion; expected w: 1.0 for straight")
     return Pose(x=x, y=y, yaw=yaw)
 
 
@@ -73,9 +73,11 @@ def in_map(frame: str, at: Pose, odom_in_map: Pose | None) -> Pose:
     if frame == MAP:
         return at
     if frame != ODOM:
-        raise Refused(f"frame {frame[:60]!r} is none of goals; expected {MAP} or {ODOM}")
+        raise Refused(f"frame {frame[:60]!r} is not valid for goals; expected {MAP} or {ODOM}")
     if odom_in_map is None:
-        raise Refused(f"a goal in {ODOM} needs the robot's place in the map, which is not known")
+        raise Refused(
+            f"a goal in {ODOM} needs a localized robot; localize it, or send the goal in {MAP}"
+        )
     return compose(odom_in_map, at)
 
 
@@ -88,7 +90,7 @@ def planar_covariance(values: Any) -> tuple[float, ...]:
     part = full[np.ix_(PLANAR, PLANAR)]
     bounded = (np.abs(part) <= MAX_COORDINATE**2).all()  # false for NaN
     if not bounded or np.linalg.eigvalsh((part + part.T) / 2).min() < -1e-9:
-        raise Refused("the covariance is none: expected finite values, symmetric, none negative")
+        raise Refused("invalid covariance: expected finite, symmetric values, none negative")
     if not part.any():
         return ()
     return tuple(float(value) for value in ((part + part.T) / 2).ravel())

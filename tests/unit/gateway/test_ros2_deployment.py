@@ -59,7 +59,7 @@ def test_a_router_with_keys_serves_no_nodes_of_ros(tmp_path):
     def of(**settings):
         return Deployment(ros2=Ros2Config(**settings), keys=str(tmp_path / "keys"))
 
-    with pytest.raises(ConfigError, match="no identity at a router with keys"):
+    with pytest.raises(ConfigError, match="ROS nodes have no keys for this router"):
         specs(of(), tmp_path)
     assert specs(of(transport="dds"), tmp_path)["ros2"][1]["settings"]["transport"] == "dds"
 
