@@ -287,8 +287,8 @@ class Bus:
         self._last_state_ns = now_ns
         if not credible and now_ns - self._refusing_since_ns > CLOCK_LOST_NS:
             self._fail(ClockLost(
-                f"every {topic.key} has been refused for {CLOCK_LOST_NS / 1e9:g} s: this process "
-                f"is at tick {self.time.tick}, the newest claims to be of tick {message.tick}"
+                f"refused every {topic.key} for {CLOCK_LOST_NS / 1e9:g} s: this process "
+                f"is at tick {self.time.tick}, the newest message at tick {message.tick}"
             ))  # fmt: skip
         return credible
 

@@ -19,9 +19,9 @@ COMMANDS = {
     "robots": ("demo:robots", "List the known robots."),
     "worlds": ("demo:worlds", "List the simulated worlds."),
     "render": ("demo:render", "Draw a robot in its world to a PNG file."),
-    "world add": ("world:add", "Put an obstacle or a person into the simulated world."),
+    "world add": ("world:add", "Add an obstacle or a person to the simulated world."),
     "world remove": ("world:remove", "Remove an object."),
-    "world list": ("world:list_", "List what was put in, and where the robot is."),
+    "world list": ("world:list_", "List the added objects, and where the robot is."),
     "goto": (
         "task:goto",
         "Send the robot to a place, a thing or a tag, and wait for it.",

@@ -28,7 +28,7 @@ BAR_CHARS = 20  # width of the bar of a joint's range
 WATCH_PERIOD_S = 0.2
 MAX_LABEL_CHARS = 64
 HAND_SPEED = math.radians(45)  # [rad/s], speed limit of motions by hand
-LIMP_PROMPT = "all joints are let go of, and the arm may fall; hold it, and type yes: "
+LIMP_PROMPT = "the motors switch off, and the arm may fall; hold it, then type yes: "
 
 
 def state(*, watch: bool = False, at: RobotAddress = LOCAL) -> None:
@@ -37,7 +37,7 @@ def state(*, watch: bool = False, at: RobotAddress = LOCAL) -> None:
     Example: gigabrain arm state
 
     Args:
-        watch: Go on showing them, until Ctrl-C.
+        watch: Update continuously, until Ctrl-C.
     """
 
     async def show(robot: Robot) -> None:
@@ -65,8 +65,8 @@ def jog(joint: str, distance: Distance, /, *, take: Take = False, at: RobotAddre
 
     Args:
         joint: Name of the joint; see `gigabrain arm state`.
-        distance: Distance from the last commanded position, of a limp joint from the measured one;
-            may be negative.
+        distance: Distance from the last commanded position; may be negative. For a limp joint:
+            distance from its measured position.
     """
 
     async def move(robot: Robot) -> None:
@@ -81,7 +81,7 @@ def jog(joint: str, distance: Distance, /, *, take: Take = False, at: RobotAddre
         if not limits.lower <= goal <= limits.upper:
             low, high, wanted = (scale * at for at in (limits.lower, limits.upper, goal))
             raise ConfigError(
-                f"{joint}: it goes from {low:.1f} to {high:.1f} {unit}, not to {wanted:.1f}"
+                f"{joint}: expected a goal from {low:.1f} to {high:.1f} {unit}, got {wanted:.1f}"
             )
         await _move(robot, take, {joint: goal})
 
@@ -118,13 +118,13 @@ def goto(
 
     Example: gigabrain arm goto 0.22 0.05 0.12 --pitch 60
 
-    If it cannot, it says why, and of a point that is too far, the nearest one.
+    If it cannot, it prints why. For a point out of reach it prints the nearest one.
 
     Args:
         x: Forwards, from the arm's base [m].
         y: To the left [m].
         z: Up [m].
-        pitch: How far the tool points down [degrees], 0 for level. Default: any way.
+        pitch: Angle of the tool below the horizontal [degrees]. Default: any.
     """
     from gigabrain_zenoh.decision.tasks.arm_steps import Reach
     from gigabrain_zenoh.decision.tasks.mission import Mission, Step
@@ -147,7 +147,7 @@ def pick(
     wait: Wait = True,
     at: RobotAddress = LOCAL,
 ) -> None:
-    """Pick a thing up, whose middle is at a point.
+    """Pick up a thing whose middle is at a point.
 
     Example: gigabrain arm pick 0.2388 0 0.015 --box 0.03 0.03 0.03
 
@@ -158,14 +158,14 @@ def pick(
         box: Its lengths along x, y and z [m].
         cylinder: Its radius and its height [m].
         sphere: Its radius [m].
-        yaw: How it is turned [degrees].
+        yaw: Rotation of the thing about the vertical [degrees].
     """
     from gigabrain_zenoh.decision.tasks.arm_steps import Solid
     from gigabrain_zenoh.decision.tasks.mission import Mission, Step
 
     shapes = sum(shape is not None for shape in (box, cylinder, sphere))
     if shapes != 1:
-        raise ConfigError(f"arm pick: expected --box, --cylinder or --sphere, got {shapes} of them")
+        raise ConfigError(f"arm pick: expected one of --box, --cylinder and --sphere, got {shapes}")
     thing = Solid(box=box, cylinder=cylinder, sphere=sphere, at=(x, y, z), yaw=math.radians(yaw))
     name = f"the thing at {describe_point((x, y, z))}"  # differs from a thing in the gripper
     _carry_out(at, Mission(things={name: thing}, do=(Step(pick=name),)), mode, wait)
@@ -240,10 +240,10 @@ def press(
         x: Forwards, from the arm's base [m].
         y: To the left [m].
         z: Up [m].
-        pitch: How far the tool points down [degrees], 0 for level. Default: any way.
+        pitch: Angle of the tool below the horizontal [degrees]. Default: any.
         depth: Maximum travel beyond the point [m].
-        force: With which it presses [N].
-        seconds: How long.
+        force: Force to press with [N].
+        seconds: Time to press [s].
     """
     from gigabrain_zenoh.decision.tasks.arm_steps import Press
     from gigabrain_zenoh.decision.tasks.mission import Mission, Step
@@ -269,9 +269,9 @@ def hand_over(
     `gigabrain task resume` opens it, too.
 
     Args:
-        to: Where: forwards, to the left and up from the arm's base [m]. Default: well ahead.
-        pitch: How far the tool points down [degrees], 0 for level. Default: any way.
-        seconds: How long it waits; then it keeps the thing.
+        to: Point to hand over at: x y z from the arm's base [m]. Default: ahead of the arm.
+        pitch: Angle of the tool below the horizontal [degrees]. Default: any.
+        seconds: Time to wait for the person [s]; then it keeps the thing.
     """
     from gigabrain_zenoh.decision.tasks.arm_steps import HandOver
     from gigabrain_zenoh.decision.tasks.mission import Mission, Step
@@ -293,10 +293,10 @@ def limp(*, yes: bool = False, at: RobotAddress = LOCAL) -> None:
     """
     if not yes:
         if not sys.stdin.isatty():
-            raise ConfigError("arm limp asks a person first; give --yes where nobody can answer")
+            raise ConfigError("arm limp needs an answer, but there is no terminal; add --yes")
         print(LIMP_PROMPT, end="", flush=True)
         if sys.stdin.readline().strip().lower() != "yes":  # empty at Ctrl-D
-            print_line("nothing is done")
+            print_line("nothing was done")
             return
     _ask(at, lambda robot: robot.limp())
 

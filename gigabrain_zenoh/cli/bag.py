@@ -146,7 +146,7 @@ def play(
         start: Start this long after its first message [s].
         loop: Repeat until Ctrl-C.
         remap: Publish a key on another: robot/scan=old/scan.
-        beside_robot: Also if a driver runs. Its gate drops recorded commands; its brain
+        beside_robot: Play even if a driver runs. Its gate drops recorded commands; its brain
             gets mixed data.
     """
     from gigabrain_zenoh.recording.player import PlayOptions

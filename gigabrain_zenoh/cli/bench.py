@@ -106,8 +106,8 @@ def stack(
 
     Example: gigabrain bench stack --seconds 20 --world house --goal
 
-    A robot that drives avoids obstacles, by default in the arena. An arm carries out the mission of
-    its demo, by default in the world of that.
+    A robot that drives avoids obstacles, by default in the arena. An arm carries out its demo
+    mission, by default in the world of its demo.
 
     Args:
         seconds: Duration [s].

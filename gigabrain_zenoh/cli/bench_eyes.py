@@ -45,9 +45,9 @@ def eyes(
     2 m. It needs EGL or OSMesa: set MUJOCO_GL=egl.
 
     Args:
-        worlds: Cluttered worlds.
+        worlds: Number of cluttered worlds.
         seconds: Time on each of 15 empty floors: 5 textures, 3 lights [s].
-        ghosts: Things that go away.
+        ghosts: Number of things that go away.
         seed: First random seed of the worlds and the sensor's errors.
     """
     from gigabrain_zenoh.qa.bench.eyes import measure_eyes
@@ -111,7 +111,7 @@ def cameras(
     The same robot drives without its cameras, then with them. It needs EGL or OSMesa.
 
     Args:
-        seconds: Duration of each [s].
+        seconds: Duration of each run [s].
     """
     from gigabrain_zenoh.qa.bench.camera_cost import cameras_table, measure_cameras
 

@@ -36,12 +36,12 @@ def hands(
 
     Cubes, cylinders and balls of 2 to 4 cm and 20 to 200 g lie on the table, 10 to 26 cm from the
     axis of the first joint and 90° to both sides, with frictions of 0.4 and 1. Pose and size are
-    given, or what the arm's depth camera sees, with the errors of one. Planner, control and gate
+    given, or measured by the arm's simulated depth camera. Planner, control and gate
     are those of a robot. It needs the extra `arm`.
 
     Args:
         seeds: Seeds of the things, such as 0-9 or 3,5,20-22.
-        camera: Know of the things only what the camera sees.
+        camera: Use only what the camera sees of the things.
         backlash: Play of each joint that turns, between motor and joint [degrees], 0 to 10.
     """
     from gigabrain_zenoh.qa.bench.clutter import seeds_of
@@ -106,12 +106,12 @@ def reach(
     Example: gigabrain bench reach --goals 1000
 
     Goals are drawn all around the arm, over and under a shelf, and beyond its reach; every other
-    one with a pitch of the tool. It times inverse kinematics and planning, and counts on how many
-    ways the arm touched anything. Planner, control, safety and gate are those of a robot. It
-    needs the extra `arm`.
+    one with a pitch of the tool. It times inverse kinematics and planning, and counts the
+    paths on which the arm touched anything. Planner, control, safety and gate are those of a
+    robot. It needs the extra `arm`.
 
     Args:
-        goals: How many are drawn.
+        goals: Number of goals.
         seed: Seed of the goals.
     """
     from gigabrain_zenoh.qa.bench.reach import measure_reach
@@ -136,10 +136,10 @@ def _reach_table(result: "ReachResult") -> Table:
     refused = ", ".join(f"{n} {cause}" for cause, n in sorted(result.refused.items()))
     table.caption = "\n".join((
         f"{result.body}, {result.goals} goals: {result.reached} reached, off p95 "
-        f"{result.off_p95_m * 100:.1f} cm; no posture: {refused or 'none'}; no way: "
+        f"{result.off_p95_m * 100:.1f} cm; no posture: {refused or 'none'}; no path: "
         f"{sum(result.no_way.values())}; held back by safety: {result.held}. "
         f"On {len(result.touched)} ways it touched something.",
-        *(f"{n} times no way: {why}" for why, n in sorted(result.no_way.items())),
+        *(f"{n} times no path: {why}" for why, n in sorted(result.no_way.items())),
         *result.touched[:10],
     ))  # fmt: skip
     return table

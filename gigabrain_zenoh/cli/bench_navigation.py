@@ -301,8 +301,8 @@ def goals(*, options: GoalsOptions = GOALS, json: JsonFile = None, logs: Path | 
 
     Columns: time to map the world, goals reached, contacts, least clearance,
     mean time per goal, largest error of position and heading at rest (against
-    the simulator, so with errors of the map), stops of the person for the
-    robot, and ticks without the brain because the host was too busy.
+    the simulator, so with errors of the map), how often the person
+    stopped for the robot, and ticks without the brain because the host was too busy.
 
     A goal counts as reached only within 0.5 m and 15° by the simulator. Exit
     code 1 after a contact, or if over 1 % of the goals were not reached.

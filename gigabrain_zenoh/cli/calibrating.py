@@ -31,7 +31,9 @@ class Terminal:
             if live:
                 live.stop()
         if line is None:
-            raise ConfigError("nobody types: the calibration was not finished, and none is written")
+            raise ConfigError(
+                "no input: the calibration was not finished or written; run it in a terminal"
+            )
         return line
 
     def show(self, ranges: Mapping[str, JointRange]) -> None:

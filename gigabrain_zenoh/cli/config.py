@@ -169,7 +169,9 @@ def _running_rows(at: RobotAddress) -> list["Row"]:
     from gigabrain_zenoh.runtime.running import find_running
 
     if at.connect:
-        raise ConfigError("--connect: settings are kept where the robot was started; see `param`")
+        raise ConfigError(
+            "--connect: only the robot's host knows all settings; run this there, or see `param`"
+        )
     robot = find_running(at.namespace)
     if not robot.run_dir:
         raise ConfigError(f"{robot.label} was not started by `up` or `demo`; see `param list`")

@@ -193,7 +193,7 @@ def up(
 
     Args:
         deployment: Deployment file, or the name of a known one.
-        host: Which of the file's hosts this is; required if it has several.
+        host: Name of this host in the file; required if the file has several.
         map: Saved map to localize in; replaces the file's map settings.
         keys: Folder of this host's identity, instead of the one in the file.
         level: Lowest level to log.

@@ -33,7 +33,7 @@ def why(*, at: RobotAddress = LOCAL, json: bool = False) -> int:
     Example: gigabrain why
 
     It follows one command from link to link. Exit code 0 if no link is broken:
-    the robot moves, or waits, as for a goal. Otherwise the code of the broken
+    the robot moves, or waits, for example for a goal. Otherwise the code of the broken
     link: 10 router, 11 driver, 12 link to the body, 13 scan, 14 world,
     15 intent, 16 control, 17 safety, 18 gate, 19 body.
 
@@ -64,7 +64,7 @@ def why(*, at: RobotAddress = LOCAL, json: bool = False) -> int:
         print_line(f"{moves} {broken.link}: {_ended(broken.text)}")
         print_line(f"What to do: {broken.remedy}.")
     elif waits and not verdict.moves:
-        print_line(f"It stands, and no link is broken: {_ended(waits.text)}")
+        print_line(f"It does not move, but no link is broken: {_ended(waits.text)}")
         print_line(f"What to do: {waits.remedy}.")
     else:
         print_line("It moves.")

@@ -56,7 +56,7 @@ def test(
     A check that does not apply to a link is shown as skipped, with the reason.
 
     Args:
-        link: Link to test over. Default: emulated where the robot has it, as it shows more.
+        link: Link to test over. Default: emulated if the robot has it, as it checks more.
         repeat: Number of times to try each stop; the table shows the worst and the median.
     """
     from rich.console import Console
@@ -102,7 +102,7 @@ def trace(
 
     It runs the driver itself: on an emulator, or on the real port, which no
     other process may have open. A real robot gets the command zero only.
-    A driver that runs already logs the same lines with
+    A running driver logs the same lines with
     `gigabrain driver run NAME --link real --level debug`.
 
     Exit code 1 if nothing was received.
@@ -158,7 +158,7 @@ def bringup(name: Body, *, link: Literal["emulated", "real"] = "real", seconds: 
 def calibrate(
     name: Body, *, port: str | None = None, file: Path | None = None, leader: bool = False
 ) -> None:
-    """Calibrate an arm: its motors let go, and a person moves each joint by hand.
+    """Calibrate an arm: its motors switch off, and a person moves each joint by hand.
 
     Example: gigabrain driver calibrate so101 --port /dev/ttyACM0
 
@@ -166,9 +166,9 @@ def calibrate(
     limits of each joint into the servos. No process may drive the arm meanwhile.
 
     Args:
-        port: Port of the arm, if it is another than in the robot's file.
-        file: File to write. Default: that of the robot's file, or one in the state folder.
-        leader: It is a second arm, which leads the robot's: `gigabrain teleop --leader`.
+        port: Port of the arm. Default: the one in the robot's file.
+        file: File to write. Default: the one in the robot's file, or one in the state folder.
+        leader: Calibrate a second arm that leads the robot's: `gigabrain teleop --leader`.
     """
     from msgspec.structs import replace
 

@@ -36,7 +36,7 @@ def estop(*, at: RobotAddress = LOCAL, reason: str = "") -> None:
 
     Example: gigabrain estop --reason "a person is in the way"
 
-    Exit code 3 and NOT CONFIRMED if no robot has confirmed that it stands.
+    Exit code 3 and NOT CONFIRMED if no robot has confirmed the stop.
     Then press the hardware e-stop or cut the power.
 
     Args:
@@ -54,7 +54,7 @@ def estop(*, at: RobotAddress = LOCAL, reason: str = "") -> None:
 
 
 def release(*, at: RobotAddress = LOCAL) -> None:
-    """Release a latched robot. It moves only once it is enabled as well.
+    """Release a latched robot. It moves only after `gigabrain enable`.
 
     Example: gigabrain release
     """
@@ -113,7 +113,7 @@ def audit(
         run_async(_print_live(at, newest, follow, to_text))
         return
     if follow or at.connect:
-        raise ConfigError(f"{robot!r} names a robot that does not run; leave out the name")
+        raise ConfigError(f"--follow and --connect are for a running robot; leave out {robot!r}")
     for record in read_audit(_audit_folder(robot), newest):
         print_line(to_text(record))
 

@@ -66,8 +66,8 @@ def issue(
     Args:
         role: Role of the identity.
         name: Name of its folder. Default: role and robot.
-        host: Address or name under which others reach the router there; may be given again.
-        robot: Namespace of the robot. Without it, an operator, viewer or dispatcher is for all.
+        host: Address or name where others reach its router; may be given again.
+        robot: Namespace of the robot. Default: all robots, for an operator, viewer or dispatcher.
         process: Name of the process of your own, for the role process.
         days: Days until it expires.
     """
@@ -85,7 +85,7 @@ def issue(
 
 
 def revoke(role: Role, *, robot: str = "", process: str = "", dir: FleetFolder = None) -> None:
-    """Revoke all identities of a role, such as those of a lost laptop. New ones are valid.
+    """Revoke all identities of a role, such as those of a lost laptop. Later ones stay valid.
 
     Example: gigabrain keys revoke operator
 

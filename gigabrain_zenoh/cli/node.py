@@ -281,5 +281,5 @@ def _param_answers(
     replies = on_bus(at, ask)
     if not replies:
         silent = process or "any process"
-        raise BodyLost(f"no answer from {silent}; check that it runs, and that your keys may ask")
+        raise BodyLost(f"no answer from {silent}; check that it runs, and that your keys permit it")
     return replies

@@ -58,12 +58,12 @@ def pose(x: Number, y: Number, yaw: Number | None = None, /, *, at: RobotAddress
 
     Example: gigabrain pose 3.0 1.5 1.57
 
-    Exit code 0 once it is found there.
+    Exit code 0 once the scan confirms it.
 
     Args:
-        x: Place in the map [m], to some 0.5 m.
+        x: Place in the map [m], within about 0.5 m.
         y: Place in the map [m].
-        yaw: Heading [rad], to some 0.5 rad. Default: any.
+        yaw: Heading [rad], within about 0.5 rad. Default: any.
     """
     from gigabrain_zenoh.client.objects import set_pose
 

@@ -238,7 +238,7 @@ def usage_error(error: CycloptsError) -> str:
             missing = f"{given}: a value is missing" if given else f"missing {_shown(argument)}"
             return missing + see
         case RepeatArgumentError(token=token):
-            return f"{token.keyword}: given twice"
+            return f"{token.keyword}: given twice; give it once"
         case CoercionError(argument=Argument() as argument, token=token) if token:
             type_, got = error.target_type, token.value
             choices = [each for each in get_args(type_) if isinstance(each, str)]

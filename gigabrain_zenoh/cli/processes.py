@@ -95,7 +95,7 @@ def router(
 
     Args:
         listen: Zenoh endpoint to listen on; may be given again.
-        fleet: Namespace of a robot that it serves, where it has keys; may be given again.
+        fleet: Namespace of a robot that it serves, with --keys; may be given again.
         insecure: Listen beyond loopback without keys: anybody on the network can then drive.
     """
     keys = process.folder
@@ -147,7 +147,7 @@ def new(
 
     Args:
         name: Its name: lower-case letters, digits, underscores.
-        kind: A whole process, a perception step, or what decides where to drive.
+        kind: A whole process, a perception step, or a behaviour that chooses the motion.
         folder: Where to create the package's folder.
     """
     from gigabrain_zenoh.qa.scaffold.packages import write_package

@@ -103,12 +103,12 @@ def topics(
 
     Example: gigabrain ros2 topics --transport dds
 
-    It joins ROS for a few seconds, until nothing new is found. Give the
-    gateway's own options: transport, domain and namespace. Below the list it
-    says what keeps nodes apart, as types or QoS that do not match.
+    It joins ROS for a few seconds, until nothing new is found. Give it
+    the gateway's own options: transport, domain and namespace. Below the list
+    it names what keeps nodes apart, such as types or QoS that do not match.
 
     Args:
-        all_topics: Also list what every node has, and the parts of actions.
+        all_topics: Also list the topics that every node has, and the parts of actions.
     """
     link = checked(options.given(), Ros2Link, RENAMED)
     if link.transport == "rmw_zenoh" and not link.router:
@@ -159,7 +159,7 @@ def pass_(
     A ROS topic starts with /, a key does not. A key may be any topic of the
     robot, or one of your own below robot/, with JSON or MessagePack. ROS
     writes to your own keys only: it drives the robot through the gateway.
-    Nothing is encoded while nobody reads.
+    Messages are encoded only while something subscribes.
 
     Args:
         source: Key or ROS topic to read.

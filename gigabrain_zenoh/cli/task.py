@@ -20,7 +20,7 @@ Coordinate = Annotated[float, Parameter(allow_leading_hyphen=True)]
 Mode = Annotated[
     Literal["replace", "queue", "preempt"],
     Parameter(
-        help="Replace all tasks, append to the queue, or run now and resume the others after."
+        help="Replace all tasks, append to the queue, or run now and resume the others later."
     ),
 ]
 Wait = Annotated[
@@ -59,8 +59,8 @@ def goto(
         place: Place in the map: x [m], or the name of a place; see `gigabrain place list`.
         y: Place in the map [m], if x is given.
         yaw: Heading on arrival [rad]. Default: any, or that of the named place.
-        object: Class of a thing: before the nearest one. If none is known, it looks for one.
-        tag: Number of an AprilTag: before its face.
+        object: Class of a thing: go to the nearest one. If none is known, look for one.
+        tag: Number of an AprilTag: go to a place in front of it.
     """
     if object or tag is not None:
         if place or (object and tag is not None):
@@ -185,7 +185,7 @@ def pause(task: TaskName = "", /, *, at: RobotAddress = LOCAL) -> None:
 
 
 def resume(task: TaskName = "", /, *, at: RobotAddress = LOCAL) -> None:
-    """Resume a paused task, or have an arm let go of what it hands over.
+    """Resume a paused task, or open the gripper of an arm that hands something over.
 
     Example: gigabrain task resume
     """

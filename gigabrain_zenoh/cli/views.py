@@ -30,12 +30,13 @@ def teleop(
     Speeds stay within the limits of safety. Releasing a key stops the robot.
     The space bar is the e-stop. At the end the robot's brain drives again.
 
-    With a leader, the robot's arm goes slowly to its posture, then follows it.
-    The leader's motors are switched off. At the end the arm holds where it is.
+    With --leader, the robot's arm moves slowly to the leader's posture, then follows it.
+    The leader's motors are switched off. At the end the arm holds its position.
 
     Args:
         leader: Port of a second SO-101, such as /dev/ttyACM1, that you move by hand.
-        leader_calibration: Its file. Default: that of `driver calibrate so101 --leader`.
+        leader_calibration: Its calibration file. Default: that of
+            `driver calibrate so101 --leader`.
     """
     if leader is not None:
         _follow(leader, leader_calibration, at, take)
@@ -111,8 +112,8 @@ def page(*, options: PageOptions = LOCAL_PAGE, at: RobotAddress = LOCAL) -> int:
 
     Example: gigabrain page --port 8080
 
-    Beyond this machine it needs a certificate, and a token for each visitor:
-    one token to drive, one to look. Both are printed when they are made, and
+    On a network it needs a certificate, and a token for each visitor:
+    one token to drive, one to view. Both are printed when they are made, and
     kept in a file of mode 0600.
     """
     from gigabrain_zenoh.ui.page.access import check

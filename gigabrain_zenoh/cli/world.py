@@ -25,22 +25,22 @@ def add(
     name: str = "",
     at: RobotAddress = LOCAL,
 ) -> None:
-    """Put an obstacle or a person into the simulated world, while the robot drives.
+    """Add an obstacle or a person to the simulated world, while the robot drives.
 
     Example: gigabrain world add person 1.5 2 --to 1.5 -2
 
     Places are in the frame of the world, in metres, as in a world file.
-    `gigabrain world list` says where the robot is.
+    `gigabrain world list` shows where the robot is.
 
     Args:
-        kind: What to put in.
-        x: Its middle [m].
-        y: Its middle [m].
-        size: Size along its x and y, and its height [m]. Default: 0.3 0.3 0.5.
-        yaw: Angle by which it is turned [rad].
-        to: Place that a person walks to, and back from [m]; may be given again.
+        kind: Kind of object to add.
+        x: Middle of the object [m].
+        y: Middle of the object [m].
+        size: Length along x, length along y, and height [m]. Default: 0.3 0.3 0.5.
+        yaw: Rotation about the vertical [rad].
+        to: Place to which a person walks and returns [m]; may be given again.
         speed: Speed of a person [m/s].
-        name: Name to remove it by. Default: its kind and a number.
+        name: Name, for `world remove`. Default: its kind and a number.
     """
     from gigabrain_schemas.sim import SimRequest, Thing
 
@@ -54,12 +54,12 @@ def add(
 
 
 def remove(name: str, /, *, at: RobotAddress = LOCAL) -> None:
-    """Take something out of the simulated world that was put in by hand.
+    """Remove an object that was added to the simulated world.
 
     Example: gigabrain world remove box1
 
     Args:
-        name: Its name; see `gigabrain world list`.
+        name: Name of the object; see `gigabrain world list`.
     """
     from gigabrain_schemas.sim import SimRequest
 
@@ -68,7 +68,7 @@ def remove(name: str, /, *, at: RobotAddress = LOCAL) -> None:
 
 
 def list_(*, at: RobotAddress = LOCAL) -> None:
-    """List what was put into the simulated world by hand, and where the robot is in it.
+    """List the objects that were added to the simulated world, and where the robot is.
 
     Example: gigabrain world list
     """

@@ -140,9 +140,9 @@ async def _here(bus: "Bus") -> dict[str, Any]:
     try:
         pose = await asyncio.wait_for(found, POSE_TIMEOUT_S)
     except TimeoutError:
-        raise BodyLost("no pose in a map from the robot; give x and y") from None
+        raise BodyLost("the robot has no pose in a map; give x and y") from None
     if not pose.localized:
-        raise Refused("the robot does not know where it is; give x and y")
+        raise Refused("the robot is not localized; give x and y")
     return {"x": pose.x, "y": pose.y, "yaw": pose.yaw}
 
 

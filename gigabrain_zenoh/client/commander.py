@@ -137,7 +137,8 @@ class Commander:
         """Ask the gate for the body, unless this script lost it. Raises Refused."""
         if self._lease.lost:
             state = await self.read_state()
-            reason = f"{state.gate.commander or 'an e-stop'} has the body"
+            commander = state.gate.commander
+            reason = f"{commander} drives" if commander else "the gate has stopped the robot"
             if self._lease.restarted(state):
                 reason = "the driver was restarted"
             raise Refused(f"{state.robot_type}: {reason}; ask again with enable(take=True)")

@@ -20,7 +20,7 @@ LOCALIZE_TIMEOUT_S = 4.0  # for the scan to confirm a pose
 MAX_POSE_ERROR_M = 1.2  # between the given and the confirmed pose
 OLD_POSES_S = 0.1  # poses from before the request may still arrive this long
 NO_OBJECTS = (
-    "no process remembers things; the robot needs a camera (--cameras), and perception a map "
+    "no process stores things; the robot needs a camera (--cameras), and perception a map "
     "(mapping: slam or localize)"
 )
 
@@ -72,14 +72,14 @@ async def set_pose(bus: Bus, x: float, y: float, yaw: float | None = None) -> Po
         pose = await asyncio.wait_for(found, LOCALIZE_TIMEOUT_S)
     except TimeoutError:
         raise Refused(
-            f"not found: the scan does not tell its place round ({x:.2f}, {y:.2f}); "
-            "the whole map is searched; check the place, or drive the robot a little"
+            f"not found: the scan does not determine the robot's place near ({x:.2f}, {y:.2f}); "
+            "the whole map is searched; correct x and y, or drive the robot a little"
         ) from None
     finally:
         close()
     if math.hypot(pose.x - x, pose.y - y) > MAX_POSE_ERROR_M:
         raise Refused(
-            f"the scan does not fit round ({x:.2f}, {y:.2f}); the robot is localized at "
+            f"the scan does not match the map near ({x:.2f}, {y:.2f}); the robot is localized at "
             f"({pose.x:.2f}, {pose.y:.2f})"
         )
     return pose

@@ -199,8 +199,8 @@ class Tasks:
                 missing = 0 if known else missing + 1
                 if missing == MAX_STATUSES_WITHOUT:
                     raise BodyLost(
-                        f"the robot does not know {task} (any more); "
-                        "`gigabrain task list` shows what it knows"
+                        f"the robot has no task {task}, or has forgotten it; "
+                        "see `gigabrain task list`"
                     )
                 if on_status:
                     on_status(status)

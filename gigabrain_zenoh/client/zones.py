@@ -21,7 +21,7 @@ ANSWER_S = 5.0  # timeout of a reply
 LARGE_MAP_S = 20.0  # timeout where a large map is written or read
 NO_MAPPING = (
     "no process makes or uses a map; set perception: {mapping: slam} or {mapping: localize}, "
-    "and check that your keys may ask"
+    "and check that your keys permit it"
 )
 Q = TypeVar("Q", bound=Message)
 R = TypeVar("R", bound=Message)

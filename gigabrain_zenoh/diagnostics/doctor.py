@@ -236,7 +236,7 @@ def _certificate(machine: MachineFacts) -> Iterator[Diagnosis]:
 
 def _router(robot: RobotFacts) -> Iterator[Diagnosis]:
     if robot.problem and robot.port_open:
-        cure = "use the robot's --keys, or stop what else uses that port"
+        cure = "name the robot's keys with --keys, or stop the program on that port"
         yield _bad("router", f"{robot.problem} Something listens on that port.", cure)
     elif robot.problem and robot.router:
         cure = "start the robot there, open its port in the firewall, or name it with --connect"

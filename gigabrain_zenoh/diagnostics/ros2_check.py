@@ -108,7 +108,7 @@ def _reach(gateway: Description, shell: Shell) -> Iterator[Point]:
         text = f"the gateway finds nodes of its own machine only, {gateway.host}"
         yield Point("bad", text, "set localhost: false")
     if server := variables.get("ROS_DISCOVERY_SERVER"):
-        text = f"nodes of this shell are found by a discovery server, {server}, and not by ours"
+        text = f"nodes of this shell use the discovery server {server}, the gateway does not"
         yield Point("bad", text, "unset ROS_DISCOVERY_SERVER")
     if here and not shell.multicast and not gateway.report.get("localhost"):
         cure = "sudo ip link set dev INTERFACE multicast on; or set localhost: true"

@@ -290,7 +290,7 @@ def _safety(facts: ChainFacts) -> LinkStatus:
         return _broken("safety", text, remedy or READ_SAFETY_LOG)
     wanted = facts.intent.twist if facts.intent else None
     if wanted and not _other_commander(facts) and _capped_to_rest(wanted, safety.caps):
-        text = f"safety blocks that direction: {text}"
+        text = f"safety blocks the commanded direction: {text}"
         return _broken("safety", text, remedy or READ_SAFETY_LOG)
     return _ok("safety", f"{safety.verdict}{': ' if text else ''}{text}")
 
@@ -307,7 +307,7 @@ def _gate(facts: ChainFacts) -> LinkStatus:
         text = f"{gate.mode}: {text or 'not enabled yet'}"
         return _broken("gate", text, f"{remedy}; {act}" if remedy else act)
     if at_rest(facts.fastest) and gate.commander != BRAIN:
-        remedy = "let it drive, or take the robot back with `gigabrain enable --take`"
+        remedy = "have it send commands, or take the robot back with `gigabrain enable --take`"
         return _broken("gate", f"{gate.commander} drives, but sends no motion", remedy)
     return _ok("gate", f"open for {gate.commander}")
 
@@ -320,7 +320,7 @@ def _body(facts: ChainFacts) -> LinkStatus:
     speed = f"{now.linear_x:+.2f} m/s {now.angular_z:+.2f} rad/s"
     if at_rest(now) and not at_rest(commanded):
         wanted = f"{commanded.linear_x:+.2f} m/s {commanded.angular_z:+.2f} rad/s"
-        remedy = "check whether it is blocked, its motors, and their power"
+        remedy = "check whether something blocks it, then its motors and their power"
         return _broken("body", f"no motion, but the command is {wanted}", remedy)
     if at_rest(now):
         return _waits("body", "it stands, as commanded", "send it a command or a goal")

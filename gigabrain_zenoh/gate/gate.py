@@ -65,7 +65,7 @@ def release(state: GateState, event: Release) -> tuple[GateState, Outcome]:
     if event.estop_generation != state.estop_generation:
         newest = state.estop_generation
         return rejected(
-            state, f"wrong e-stop number, newest {newest}; check its cause, then release"
+            state, f"wrong e-stop number, the newest is {newest}; check its cause, then release"
         )
     if state.still_ticks < STILL_TICKS:
         return rejected(state, "the body is not at rest yet; wait half a second")

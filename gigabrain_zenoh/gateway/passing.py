@@ -103,8 +103,8 @@ def check_writer(keys: str, key: str) -> None:
 def robots_own(key: str) -> Refused:
     """Return the error for a key that the robot itself uses."""
     return Refused(
-        f"{key} is the robot's own: not writable here; command the robot through the gateway, "
-        "`gigabrain ros2`"
+        f"{key} belongs to the robot, and is not writable here; command the robot through the "
+        "gateway, `gigabrain ros2`"
     )
 
 
@@ -124,7 +124,7 @@ def check_fields(types: Types, route: Route, topic: Topic[Any] | None) -> None:
     if topic is None or route.form == "json":
         return
     if route.form == "cdr":
-        raise ConfigError(f"{route.key} is no CDR but {topic.type.__name__}; leave out --as cdr")
+        raise ConfigError(f"{route.key} carries {topic.type.__name__}, not CDR; leave out --as cdr")
     header = {field.name for field in structs.fields(Message)}
     has = [one.name for one in structs.fields(topic.type) if one.name not in header]
     wants = [name for name, _ in types.fields(route.type)]
@@ -200,7 +200,7 @@ def _json_of(text: str) -> bytes:
     try:
         msgspec.json.decode(text)
     except DECODE_ERRORS as error:
-        raise BadPayload(f"no JSON: {error}"[:MAX_ERROR_CHARS]) from None
+        raise BadPayload(f"not JSON: {error}"[:MAX_ERROR_CHARS]) from None
     return text.encode()
 
 

@@ -88,7 +88,7 @@ class Capacity:
         )
         return (
             f"this machine is too small for the robot, or too busy: {symptom}; "
-            "run fewer robots on it, or end what else needs its processors"
+            "run fewer robots on it, or stop other programs"
         )
 
 

@@ -122,7 +122,7 @@ class Deployment(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         if self.resume == "auto" and self.link == "real":
             raise ValueError("resume: auto is not allowed with link real; use manual")
         if self.speed != 1.0 and self.link != "sim":
-            raise ValueError("speed is for the simulation; other links run in real time")
+            raise ValueError("speed: works in simulation only; remove it, or use link sim")
 
     def _place_own(self) -> None:
         """Check the user's own processes, and place those without a host on the only one."""
@@ -131,7 +131,7 @@ class Deployment(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         unplaced = [name for name in (*self.processes, *self.perceptors) if name not in placed]
         if unplaced and len(self.hosts) > 1:
             where = ", ".join(self.hosts)
-            raise ValueError(f"hosts: {unplaced[0]} is on none; name it in one of: {where}")
+            raise ValueError(f"hosts: {unplaced[0]} runs on none; add it to one of: {where}")
         if unplaced:
             ((host, names),) = self.hosts.items()
             structs.force_setattr(self, "hosts", {host: (*names, *unplaced)})
@@ -147,7 +147,7 @@ class Deployment(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         except ValueError as error:
             raise ValueError(f"router: {error}") from None
         if len(self.hosts) > 1 and host and not port:
-            raise ValueError(f"router: {self.router}: several hosts need a fixed port")
+            raise ValueError(f"router: {self.router}: several hosts need a fixed port; replace 0")
         if exposed((self.router,)) and not (self.insecure or self.keys):
             raise ValueError(
                 f"router: {self.router} can be reached by anybody on the network; "

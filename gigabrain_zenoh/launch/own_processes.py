@@ -42,7 +42,7 @@ def check_entries(
     """Raise ValueError, which begins with the place in the file, for invalid entries."""
     names = [*processes, *perceptors]
     if len(names) > MAX_OWN:
-        raise ValueError(f"processes: {len(names)} of one's own; expected at most {MAX_OWN}")
+        raise ValueError(f"processes: {len(names)} of your own; expected at most {MAX_OWN}")
     for part, entries in ((MODULES, processes), (PERCEPTORS, perceptors)):
         for name in entries:
             if name in known or names.count(name) > 1:
@@ -84,9 +84,9 @@ def unknown_to_router(deployment: "Deployment", host: str, shipped: Collection[s
     if routes or not deployment.keys or not here:
         return ""
     return (
-        f"{', '.join(here)}: the router at {deployment.router} is not of this file; with keys it "
-        "drops what they publish unless its own file, or a package on its host, declares them "
-        "as well"
+        f"{', '.join(here)}: the router at {deployment.router} is not in this file, and drops "
+        "their messages if it does not know them; declare them in its file too, or install their "
+        "package on its host"
     )
 
 

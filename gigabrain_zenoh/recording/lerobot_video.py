@@ -199,7 +199,7 @@ def _frame_of(message: Message) -> Frame:
         pixels = np.ascontiguousarray(message.array())
         frame = av.VideoFrame.from_ndarray(pixels, format=RAW_FORMATS[message.encoding])
     else:
-        raise ValueError(f"{message.encoding} is no picture in colours")
+        raise ValueError(f"{message.encoding} is not a colour picture")
     even = frame.width - frame.width % 2, frame.height - frame.height % 2
     # JPEG uses all 256 levels, but players expect the limited range (ITU-R BT.601)
     return frame.reformat(*even, format="yuv420p", dst_color_range=LIMITED_RANGE)

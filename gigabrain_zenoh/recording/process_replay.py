@@ -341,8 +341,8 @@ def settings_for(path: Path, process: str, settings: dict[str, Any] | None) -> d
         notes = read_notes(path)
         if process in PROCESSES_WITH_SETTINGS and process not in notes:
             raise ConfigError(
-                f"{path} does not hold the settings of {process}: it was recorded by command; "
-                "name the robot's deployment file: --deployment FILE"
+                f"{path} does not hold the settings of {process}: it was recorded by "
+                "`gigabrain record`; name the robot's deployment file: --deployment FILE"
             )
         settings = dict(msgspec.json.decode(notes.get(process, "{}")))
     return _without_side_effects(renamed_settings(settings, process), process)

@@ -163,7 +163,7 @@ class ManagedProcess:
         self.stuck, status.last_exit = False, code
         ready_after_s = status.ready_after_s
         up_s = 0.0 if ready_after_s is None else loop.time() - self._started_s - ready_after_s
-        hopeless = "what it was given is wrong" if self.misconfigured else ""
+        hopeless = "its settings are wrong" if self.misconfigured else ""
         return Death(f"ended with {_in_words(code)}", code, up_s, hopeless)
 
     @property

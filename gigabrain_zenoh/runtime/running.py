@@ -164,10 +164,13 @@ def find_running(namespace: str = "") -> Running:
         names = ", ".join(sorted({r.endpoint.namespace or "none" for r in here}))
         raise BusError(
             f"no robot runs here with namespace {namespace!r}; known: {names}; "
-            "for one of another router, set `connect`"
+            "for one of another router, use --connect (in a script connect=)"
         )
     if not robots:
-        raise BusError("no robot runs here; start one with `gigabrain demo`, or set `connect`")
+        raise BusError(
+            "no robot runs here; start one with `gigabrain demo`, "
+            "or use --connect (in a script connect=)"
+        )
     by_address = {_address(robot): robot for robot in sorted(robots, key=_endpoint_count)}
     if len(by_address) > 1:
         where = ", ".join(f"{r.endpoint.connect[-1]} ({r.label})" for r in by_address.values())

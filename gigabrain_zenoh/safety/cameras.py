@@ -196,7 +196,7 @@ class Cameras(Struct, frozen=True, kw_only=True):
         if late := _overdue(body, camera, seen, picture, state):
             return cause("camera_lost", late)
         if seen.late and state.tick - seen.late < RECOVERY_TICKS:
-            return cause("camera_lost", f"pictures of camera {camera.name} have just come again")
+            return cause("camera_lost", f"pictures of camera {camera.name} have just come back")
         return cause(seen.code, f"camera {camera.name} {seen.text}") if seen.code else None
 
 
@@ -258,11 +258,11 @@ def _look(
     try:
         picture = image.quarter()
     except ValueError as error:
-        return marks, "camera_wrong", f"sends what is no picture: {error}"[:300]
+        return marks, "camera_wrong", f"sends invalid pictures: {error}"[:300]
     pose, up = place
     view = view_of(body, camera, up)
     if view.known < MIN_KNOWN:
-        return marks, "camera_wrong", "has a distortion in its file that no lens has"
+        return marks, "camera_wrong", "has an impossible distortion in its file"
     dark = blind(camera, view, picture)
     trusted = view._replace(sure=np.zeros_like(view.sure)) if dark else view
     found = sight(body, camera, trusted, picture)

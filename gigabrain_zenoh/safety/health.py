@@ -98,7 +98,7 @@ class Power(Struct, frozen=True, kw_only=True):
         found = []
         low = [ticks >= ticks_of(limits.battery_sustain) for ticks in self.low_ticks]
         if low[1]:
-            text = f"battery at {self.charge:.0f} %; it comes to rest"
+            text = f"battery at {self.charge:.0f} %; the robot stops"
             found.append(cause("battery_return", text))
         elif low[0]:
             found.append(cause("battery_low", f"battery at {self.charge:.0f} %"))

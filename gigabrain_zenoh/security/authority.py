@@ -82,7 +82,7 @@ def issue(
     the role `process`. Raises ConfigError.
     """
     if hosts and role not in SERVERS:
-        raise ConfigError(f"--host: only a {' or a '.join(SERVERS)} is connected to")
+        raise ConfigError(f"--host: only for the roles {' and '.join(SERVERS)}; leave it out")
     if name and (name == ".." or name != Path(name).name):  # `revoke` finds only such folders
         raise ConfigError(f"--name {name!r}: expected the name of a folder, without '/'")
     generations = generations_in(fleet_folder)
@@ -221,7 +221,7 @@ def revoke(fleet_folder: Path, role: Role, robot: str = "", process: str = "") -
     """
     if role in SERVERS:
         raise ConfigError(
-            f"keys of a {role} can also pass for a router, which no list prevents; "
+            f"a {role} identity also works as a router, so it cannot be revoked; "
             "make a new fleet with `gigabrain keys new`"
         )
     name, known = common_name(role, robot, process=process), generations_in(fleet_folder)

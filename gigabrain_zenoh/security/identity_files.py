@@ -154,16 +154,16 @@ def check_own_identity(folder: Path, process: str, namespace: str) -> None:
 
 def no_router(endpoint: Endpoint) -> BusError:
     """Return the error for a router that does not answer. Raises ConfigError for invalid keys."""
-    where, doubt = endpoint.connect[-1], "is the robot running, and without keys?"
+    where, doubt = endpoint.connect[-1], "is the robot running without keys?"
     if endpoint.keys:
         identity = identity_in(Path(endpoint.keys))
-        doubt = f"is the robot running, with keys of the fleet {identity.fleet!r}?"
+        doubt = f"is the robot running with keys of the fleet {identity.fleet!r}?"
     return BusError(f"no router answers at {where}; {doubt}")
 
 
 def may_not_ask(keys: str) -> str:
     """Return the missing right as a possible reason for no reply; routers do not report denials."""
-    return f"; or {identity_in(Path(keys)).name} may not ask for it" if keys else ""
+    return f"; or {identity_in(Path(keys)).name} may not request it" if keys else ""
 
 
 LIST = "generations.json"

@@ -55,7 +55,7 @@ def load_net(config: RecognizerConfig) -> Net | None:
     """Return the net of the settings; None without shipped weights. Raises ConfigError."""
     own = config.layout != "things"
     if own and not config.onnx:
-        text = f"recognizer: layout `{config.layout}` is for a net of one's own"
+        text = f"recognizer: layout `{config.layout}` is for your own net"
         raise ConfigError(f"{text}; name its file in `onnx`")
     if own and not config.labels:
         raise ConfigError("recognizer: labels: missing; expected a file with one class a line")
@@ -238,7 +238,7 @@ def _session(path: Path) -> Any:
         return onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
     except Exception as error:  # noqa: BLE001 - its errors have no base of their own
         why = str(error).strip().splitlines()[0][:160]
-        raise ConfigError(f"{path}: no net that ONNX Runtime can run: {why}") from None
+        raise ConfigError(f"{path}: not a net that ONNX Runtime can run: {why}") from None
 
 
 def _named(classes: Sequence[str], outputs: int, path: Path) -> tuple[str, ...]:

@@ -44,7 +44,7 @@ def decoded(image: Image) -> NDArray[np.uint8]:
         return _decompressed(image)
     pixels = image.array()
     if pixels.dtype != np.uint8:
-        raise ValueError(f"{image.encoding} is no picture in colours")
+        raise ValueError(f"{image.encoding} is not a colour picture")
     return np.ascontiguousarray(pixels[..., ::-1] if image.encoding == "rgb8" else pixels, np.uint8)
 
 

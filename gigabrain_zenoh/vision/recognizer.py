@@ -85,7 +85,7 @@ def read_net(path: Path) -> cv2.dnn.Net:
     try:
         return cv2.dnn.readNetFromONNX(str(path))
     except cv2.error as error:
-        raise ConfigError(f"{path}: no net that cv2.dnn can run: {reason(error)}") from error
+        raise ConfigError(f"{path}: not a net that cv2.dnn can run: {reason(error)}") from error
 
 
 def reason(error: cv2.error) -> str:

@@ -106,7 +106,7 @@ async def test_an_estop_holds_the_arm_at_its_position(arm: Probe) -> None:
         await arm.ticks(25)
         assert posture(arm) == pytest.approx(there, abs=0.005)
         assert there[0] < 0.0
-        with pytest.raises(Refused, match="an e-stop has the body"):
+        with pytest.raises(Refused, match="the gate has stopped the robot"):
             await script.set_joint_position("shoulder_pan", 0.0)
         await script.release()
         await script.enable(take=True)
@@ -125,10 +125,10 @@ async def test_an_arm_can_be_made_limp_on_request_and_held_again(arm: Probe) -> 
         await script.estop("test")
         await arm.ticks(25)
         before = posture(arm)
-        assert (await script.limp()).text == "all joints are let go of"
+        assert (await script.limp()).text == "all joints are limp"
         await until(lambda: arm.state.limp, "limp")
         await until(lambda: abs(posture(arm)[2] - before[2]) > 0.2, "falling")
-        assert (await script.hold()).text == "the joints hold where they are"
+        assert (await script.hold()).text == "the joints hold their positions"
         await until(lambda: not arm.state.limp, "held")
         await arm.ticks(25)
         there = posture(arm)

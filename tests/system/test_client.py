@@ -150,7 +150,7 @@ async def test_a_script_does_not_retake_a_body_that_was_taken_over(robot: Probe)
         await person.set_base_velocity(0.05)
         await until(lambda: robot.state.gate.commander == "person", "the person drives")
         await robot.ticks(5)
-        with pytest.raises(Refused, match=r"person has the body; ask again with enable\(take=True"):
+        with pytest.raises(Refused, match=r"person drives; ask again with enable\(take=True"):
             await script.set_base_velocity(0.1)
         await script.enable(take=True)
         await script.set_base_velocity(0.1)

@@ -175,7 +175,7 @@ async def test_an_estop_ends_following_and_the_arm_is_held(
         await until(lambda: sent(arm, "shoulder_pan") < -0.3, "on its way")
         assert await (await shared_home.run("estop")).ended() == 0
         assert await command.ended() == 1
-        assert "an e-stop has the body" in command.err
+        assert "the gate has stopped the robot" in command.err
         await arm.ticks(25)
         there = sent(arm, "shoulder_pan")
         await arm.ticks(25)

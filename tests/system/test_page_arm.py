@@ -66,7 +66,7 @@ class FakeArm(Fake):
     async def _let_go(self, request: LimpRequest) -> GateReply:
         self.limp_requests.append(request.limp)
         self.limp = request.limp
-        return replace(example(GateReply), text="all joints are let go of")
+        return replace(example(GateReply), text="all joints are limp")
 
     def publish_repeatedly(self) -> None:
         first, *others, last = self.body.joints
@@ -270,7 +270,7 @@ async def test_its_buttons_keep_their_places_when_it_stops(
 async def test_a_limp_arm_is_shown_as_limp(chromium: Browser, fake: FakeArm) -> None:
     fake.gate, fake.limp = LATCHED, True
     page = await opened(chromium)
-    await page.wait_for_selector("#arm-status:has-text('limp: let go of')")
+    await page.wait_for_selector("#arm-status:has-text('limp: the arm may fall')")
     assert "limp" in await page.inner_text("#doing")
     await page.get_by_label(PAN).hover()
     await page.mouse.down()
@@ -294,7 +294,7 @@ async def test_an_arm_goes_limp_after_a_confirmation_and_is_held_again(
     await page.click("#estop")  # it works during the question
     await page.wait_for_selector('#confirmed:has-text("CONFIRMED by")')
     await page.click("#let-go-yes")
-    await page.wait_for_selector("#reply:has-text('all joints are let go of')")
+    await page.wait_for_selector("#reply:has-text('all joints are limp')")
     await page.wait_for_selector("#arm-status:has-text('“Hold” holds it')")
     assert fake.limp_requests == [True]
     assert await page.is_disabled("#arm-limp")
@@ -308,7 +308,9 @@ async def test_an_enabled_arm_can_be_held_but_not_go_limp(chromium: Browser, fak
     assert await page.is_disabled("#arm-limp")
     assert await page.get_attribute("#arm-limp", "title") == "Press STOP first"
     await page.click("#arm-hold")
-    await page.wait_for_selector("#reply:has-text('held until the brain is let drive again')")
+    await page.wait_for_selector(
+        "#reply:has-text('the arm holds until the brain is enabled again')"
+    )
     await until(lambda: fake.wanted, "speeds of joints")
     assert fake.wanted == dict.fromkeys((joint.name for joint in CRANE.joints), 0.0)
     assert not fake.limp_requests

@@ -134,7 +134,7 @@ async def test_only_the_router_port_and_a_private_socket_listen(
 async def test_a_client_without_rights_gets_an_error_with_that_reason(gate: RouterOfRed) -> None:
     at = f"tls/127.0.0.1:{gate.port}"
     keys = str(gate.fleet / "viewer@red")
-    with pytest.raises(NotConfirmed, match=r"or viewer@red may not ask for it"):
+    with pytest.raises(NotConfirmed, match=r"or viewer@red may not request it"):
         async with connect(at, namespace="red", keys=keys, wait=False) as robot:
             await robot.estop()
 

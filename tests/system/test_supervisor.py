@@ -144,7 +144,7 @@ async def test_a_process_with_a_bad_configuration_is_not_restarted() -> None:
             2,
         )
         assert record["text"] == (
-            "driver ended with exit code 2 and is given up: what it was given is wrong"
+            "driver ended with exit code 2 and is given up: its settings are wrong"
         )
 
 

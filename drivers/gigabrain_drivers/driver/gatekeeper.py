@@ -40,7 +40,7 @@ UNREADABLE = Cause(
     code="latch_unreadable",
     text="the file with the gate's latched causes cannot be read",
     latching=True,
-    remedy="look at the robot, then release it",
+    remedy="check the robot, then release it",
 )
 
 CausesByCode = dict[str, tuple[str, Cause]]  # by code: origin (gate, driver or safety) and cause
@@ -216,7 +216,7 @@ class Gatekeeper:
             await set_limp(limp)
         except GigabrainError as error:
             return gate.Outcome(ok=False, text=str(error))
-        done = "all joints are let go of" if limp else "the joints hold where they are"
+        done = "all joints are limp" if limp else "the joints hold their positions"
         return gate.Outcome(text=done)
 
     def refuse_if_enabled(self) -> None:

@@ -102,7 +102,7 @@ def _type(type_: Any, path: tuple[str, ...], field: str) -> Any:
     kind = _bare(type_)
     if typing.get_origin(kind) is typing.Literal or kind in (bool, int, float, str):
         return kind
-    raise ValueError(f"{field} is no number, word or truth value; name one of its parts")
+    raise ValueError(f"{field} is not a number, word or boolean; name one of its parts")
 
 
 def _bare(type_: Any) -> Any:

@@ -150,7 +150,9 @@ class Step(Part, frozen=True, kw_only=True):
         kinds = self.__struct_fields__
         given = [kind for kind in kinds if getattr(self, kind) is not None]
         if len(given) > 1:
-            raise ValueError(f"{given[1]}: this step is {given[0]!r} already; split it in two")
+            raise ValueError(
+                f"{given[1]}: this step is {given[0]!r} already; split it into two steps"
+            )
         if not given:
             raise ValueError(f"an empty step; expected one of {', '.join(kinds)}")
 

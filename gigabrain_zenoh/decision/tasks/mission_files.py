@@ -80,7 +80,8 @@ def _without_value(node: Node) -> Iterator[tuple[int, str]]:
         empty = [entry for entry in entries if entry.node.value is None and not entry.node.text]
         kind = next((entry.key for entry in entries if entry.node.value is not None), None)
         for entry in empty if kind else ():
-            text = f"{entry.key!r} has no value, and this step is {kind!r} already; split it in two"
+            text = f"{entry.key!r} has no value, and this step is {kind!r} already; "
+            text += "split it into two steps"
             yield entry.line, text
     for inner in (*(node.items or ()), *(entry.node for entry in node.entries or ())):
         yield from _without_value(inner)

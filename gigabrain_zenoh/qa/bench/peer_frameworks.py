@@ -50,7 +50,9 @@ def _interpreter(script: str) -> str:
     """Return the interpreter that a script's first line names. Raises GigabrainError."""
     first = Path(script).read_bytes().partition(b"\n")[0].decode(errors="replace")
     if not first.startswith("#!"):
-        raise GigabrainError(f"{script} is no Python script; expected the one that pip or apt has")
+        raise GigabrainError(
+            f"{script} is not a Python script; expected the one that pip or apt has"
+        )
     return first.removeprefix("#!").split()[-1]
 
 

@@ -44,7 +44,7 @@ def write_package(name: str, folder: Path) -> Path:
     if not PACKAGE_NAME.fullmatch(name) or keyword.iskeyword(name):
         raise ConfigError(
             f"{name!r}: expected lower-case letters, digits and underscores, such as my_robot; "
-            "2 to 64 of them, and no keyword of Python"
+            "2 to 64 of them, and not a keyword of Python"
         )
     if name in robot_files() or name in known_drivers():
         raise ConfigError(f"a robot or a driver is called {name!r} already; choose another name")

@@ -141,7 +141,7 @@ class RequestHandler:
             wanted = replace(request.world or SimRequest(), source=self._bus.process)
             return (await change_world(self._bus, wanted)).text, ""
         if request.what == "hold" and self._hold_joints():
-            return "the arm is held until the brain is let drive again", ""
+            return "the arm holds until the brain is enabled again", ""
         if request.what == "estop":
             reply = await press_estop(self._bus, "operator page")
         elif request.what == "release":
@@ -156,7 +156,7 @@ class RequestHandler:
         """Let an arm go limp, or hold a limp one."""
         limp = request.what == "limp"
         if limp and request.value != "yes":
-            raise Refused("an arm that is let go of may fall: a person must agree to it first")
+            raise Refused("a limp arm may fall: a person must confirm this first")
         return await let_go(self._bus, limp)
 
     async def _change_zones(self, request: PageRequest) -> str:

@@ -177,7 +177,7 @@ async def test_over_rmw_zenoh_both_commands_use_the_robots_router(
 @pytest.mark.parametrize(
     ("words", "error"),
     [
-        (("/drive", "robot/cmd_vel", "geometry_msgs/Twist"), "robot/cmd_vel is the robot's own"),
+        (("/drive", "robot/cmd_vel", "geometry_msgs/Twist"), "robot/cmd_vel belongs to the robot"),
         (("robot/wrold", "/world", "std_msgs/String"), "did you mean 'world'"),
         (("robot/world", "/world", "std_msgs/String"), "no field in common"),
         (("robot/world", "/world", "std_msgs/Strng"), "did you mean 'std_msgs/msg/String'"),

@@ -150,7 +150,7 @@ async def test_an_arm_does_not_go_on_after_an_e_stop_by_somebody_else(
     moving = asyncio.ensure_future(robot.set_joint_positions({JOINT.name: GOAL}))
     await robot._wait_ticks(25)
     driver.gate = GateStatus(mode="latched", enables=1, estop_generation=1)
-    with pytest.raises(Refused, match="an e-stop has the body"):
+    with pytest.raises(Refused, match="the gate has stopped the robot"):
         await moving
     stopped = driver.joints[JOINT.name]
     await robot.release()

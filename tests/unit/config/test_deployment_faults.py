@@ -36,7 +36,7 @@ PORT = "expected a path, or usb:VID:PID[:SERIAL], got"
         ("body: mock\nrouter: localhost", "f:2: router: 'localhost' is not a Zenoh endpoint"),
         (
             "hosts:\n  a: [router]\n  b: [driver]\nrouter: tcp/127.0.0.1:0",
-            "f:4: router: tcp/127.0.0.1:0: several hosts need a fixed port",
+            "f:4: router: tcp/127.0.0.1:0: several hosts need a fixed port; replace 0",
         ),
         (
             "body: mock\nhosts:\n  a: [driver]\n  b: [driver]",
@@ -55,7 +55,7 @@ PORT = "expected a path, or usb:VID:PID[:SERIAL], got"
         ("namespace: a//b", "f:1: namespace: expected a name such as red, or names joined by '/'"),
         ("namespace: ../red", "f:1: namespace: expected a name such as red, or names joined by"),
         ("namespace: red*", "f:1: namespace: expected a name such as red, or names joined by '/'"),
-        ("link: emulated\nspeed: 2", "f:2: speed is for the simulation"),
+        ("link: emulated\nspeed: 2", "f:2: speed: works in simulation only"),
         ("body: mock\nbutton:\n  port: ''", f"f:3: button.port: {PORT} ''"),
         ("body: mock\nbutton:\n  port: usb:xyz", f"f:3: button.port: {PORT} 'usb:xyz'"),
     ],

@@ -45,11 +45,11 @@ from gigabrain_zenoh.errors import ConfigError
         ("do:\n- hand_over: ~", "do[0].hand_over: expected a list of 3 or a mapping, got ~; write"),
         (
             "do:\n- wait: 1\n- explore:\n  wait: 5",
-            "m:3: 'explore' has no value, and this step is 'wait' already; split it in two",
+            "m:3: 'explore' has no value, and this step is 'wait' already; split it into two steps",
         ),
         (
             "trees: {a: [{retry: {times: 2, do: [{goto: [1, 2], visit: }]}}]}\ndo: [{tree: a}]",
-            "m:1: 'visit' has no value, and this step is 'goto' already; split it in two",
+            "m:1: 'visit' has no value, and this step is 'goto' already; split it into two steps",
         ),
         ("do:\n- goto:", "m:2: do[0].goto: expected a string of length <= 64 or a list of length"),
         ("do:\n- timeout:", "m:2: do[0].timeout: expected a mapping, got nothing"),
@@ -97,7 +97,7 @@ from gigabrain_zenoh.errors import ConfigError
             "m:2: do[0].check: imu.orientation.7: no index 7; expected 0 to 3",
         ),
         ("do:\n- check: joints.128.position > 1", "no index 128; expected 0 to 127"),
-        ("do:\n- check: map.cells == 3", "map.cells is no number, word or truth value"),
+        ("do:\n- check: map.cells == 3", "map.cells is not a number, word or boolean"),
         (
             f"do:\n- check: joints.{'9' * 5000}.position > 1",
             "m:2: do[0].check: expected a string of length <= 200",

@@ -23,8 +23,8 @@ from tests.unit.drivers import feetech as so101
 from tests.unit.drivers import piper
 
 Ask = Callable[[bool], Awaitable[tuple[bool, str]]]
-LET_GO = (True, "all joints are let go of")
-HELD = (True, "the joints hold where they are")
+LET_GO = (True, "all joints are limp")
+HELD = (True, "the joints hold their positions")
 
 
 @asynccontextmanager
@@ -133,7 +133,10 @@ async def test_an_arm_without_power_is_not_said_to_hold(tmp_path: Path) -> None:
         rig.link.to_arm = lambda data: None
         await rig.wait(200)
         refused = await ask(False)
-        assert refused == (False, "servo 1 (shoulder_pan) answers no more: cable, power?")
+        assert refused == (
+            False,
+            "servo 1 (shoulder_pan) no longer answers: check its cable and power",
+        )
     assert audited(tmp_path)[1:] == [("hold", *refused)]
 
 

@@ -77,7 +77,7 @@ def test_a_release_must_name_the_newest_estop(generation: int) -> None:
     rig.feed(gate.Estop("alice"))
     rig.tick(30)
     assert rig.feed(gate.Release(generation)) == gate.Outcome(
-        ok=False, text="wrong e-stop number, newest 2; check its cause, then release"
+        ok=False, text="wrong e-stop number, the newest is 2; check its cause, then release"
     )
     assert rig.mode == "latched"
     assert rig.feed(gate.Release(2)).ok

@@ -288,7 +288,7 @@ async def test_the_key_that_this_body_obeys_is_refused(ends: Ends) -> None:
     talker = ends.node.publisher("/chatter", STRING)
     ends.listen("robot/drive")
     passage = ends.passage("/chatter", "robot/drive", STRING, "fields")
-    with pytest.raises(Refused, match="robot/drive is the robot's own"):
+    with pytest.raises(Refused, match="robot/drive belongs to the robot"):
         await passage.run()
     talker.publish(string("drive"))
     assert ends.got == []

@@ -4,7 +4,7 @@ from gigabrain_zenoh.launch.demo import Capacity
 
 SMALL = (
     "this machine is too small for the robot, or too busy: its time runs at 60% of real time; "
-    "run fewer robots on it, or end what else needs its processors"
+    "run fewer robots on it, or stop other programs"
 )
 
 

@@ -253,8 +253,9 @@ async def test_up_names_processes_that_the_router_of_another_robot_may_not_know(
     lines: list[str] = []
     await up(replace(DEPLOYMENT, **blue, processes=processes), "robot", lines.append)
     assert [line for line in lines if line.startswith("warning: ")] == [
-        f"warning: {name}: the router at {router} is not of this file; with keys it drops what "
-        "they publish unless its own file, or a package on its host, declares them as well"
+        f"warning: {name}: the router at {router} is not in this file, and drops "
+        "their messages if it does not know them; declare them in its file too, or install their "
+        "package on its host"
         for name in told
     ]
 

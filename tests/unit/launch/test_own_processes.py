@@ -116,7 +116,9 @@ def test_hosts_may_place_it_and_several_hosts_must(tmp_path: Path) -> None:
     hosts = "hosts: {robot: [router, driver], laptop: [perception%s]}\n"
     placed = load_deployment(written(tmp_path, MINE + hosts % ", mine"))
     assert placed.hosts["laptop"] == ("perception", "mine")
-    with pytest.raises(ConfigError, match=r"robot\.yaml:5: hosts: mine is on none; name it in one"):
+    with pytest.raises(
+        ConfigError, match=r"robot\.yaml:5: hosts: mine runs on none; add it to one"
+    ):
         load_deployment(written(tmp_path, MINE + hosts % ""))
 
 
@@ -219,4 +221,4 @@ def test_a_process_of_a_package_may_be_unknown_to_the_router_of_another_robot_to
         router="tcp/10.0.0.1:7447",
     )
     warning = unknown_to_router(deployment, "robot", PROCESSES)
-    assert warning.startswith("lamp: the router at tcp/10.0.0.1:7447 is not of this file; with ")
+    assert warning.startswith("lamp: the router at tcp/10.0.0.1:7447 is not in this file, and ")

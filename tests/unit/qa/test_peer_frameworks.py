@@ -32,7 +32,7 @@ def test_a_command_that_is_no_script_is_named(
 ) -> None:
     monkeypatch.setenv("PATH", str(tmp_path))
     path = command(tmp_path, "dora", "\x7fELF")
-    with pytest.raises(GigabrainError, match=f"{path} is no Python script"):
+    with pytest.raises(GigabrainError, match=f"{path} is not a Python script"):
         peer_frameworks.installed()
 
 

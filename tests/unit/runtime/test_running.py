@@ -140,7 +140,7 @@ def test_of_several_robots_the_namespace_chooses(notes: Path) -> None:
             find_endpoint(None, "gamma")
         assert str(unknown.value) == (
             "no robot runs here with namespace 'gamma'; known: alpha, beta; "
-            "for one of another router, set `connect`"
+            "for one of another router, use --connect (in a script connect=)"
         )
 
 

@@ -353,7 +353,7 @@ async def test_an_arm_goes_limp_only_if_a_person_agrees() -> None:
     for value in ("", "no"):
         reply = await handler.handle(PageRequest(id=7, what="limp", value=value))
         assert not reply.ok
-        assert reply.text == "an arm that is let go of may fall: a person must agree to it first"
+        assert reply.text == "a limp arm may fall: a person must confirm this first"
     assert not asked
     assert (await handler.handle(PageRequest(id=8, what="limp", value="yes"))).ok
     assert (await handler.handle(PageRequest(id=9, what="hold"))).ok

@@ -5,7 +5,7 @@ const PERIOD_MS = 40
 const MAX_TOOL_SPEED = 0.3 // [m/s]
 const AXES = ['x', 'y', 'z'] // of the base
 const MIN_MOVING_SPEED = 0.05 // [rad/s] or [m/s]
-const LIMP = 'limp: let go of, so it may fall; “Hold” holds it'
+const LIMP = 'limp: the arm may fall; “Hold” holds it'
 
 /** Return the position or the speed of a joint as text: in degrees, or in millimetres for a sliding joint. */
 function inUnit(joint, value, suffix = '') {

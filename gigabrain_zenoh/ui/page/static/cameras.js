@@ -60,7 +60,7 @@ export class Cameras {
   setStatus(cameras) {
     for (const { name, ok, problem } of cameras) {
       this.add([name])
-      const view = this.#viewOf(name), blind = ok ? '' : problem || 'cannot be believed'
+      const view = this.#viewOf(name), blind = ok ? '' : problem || 'not plausible'
       if (!view || view.blind === blind) continue
       view.blind = blind
       this.#showProblem(view)

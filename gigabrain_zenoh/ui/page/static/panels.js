@@ -64,7 +64,7 @@ export function showFigures(state, robot) {
 function activity(state, robot) {
   if (!state) return 'no messages from the robot'
   const { mode, commander } = state.gate
-  if (state.limp) return 'limp: its joints are let go of'
+  if (state.limp) return 'limp: the motors of its joints are off'
   if (mode !== 'enabled' && compiling.size) return `compiling, once per installation: ${[...compiling].join(', ')}`
   if (mode !== 'enabled') return mode === 'idle' ? 'idle: waiting to be enabled' : MODES[mode]
   if (commander !== 'control') return `${commander} drives`

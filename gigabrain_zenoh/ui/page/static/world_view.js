@@ -189,7 +189,7 @@ export class WorldView {
       return { name, distance: Math.hypot(at_x - x, at_y - y), reach }
     }).filter(({ distance, reach }) => distance <= reach).sort((a, b) => a.distance - b.distance)
     if (near.length) this.#request({ do: 'remove', name: near[0].name })
-    else this.say('nothing that was put in by hand is there', false)
+    else this.say('there is no added object at this place', false)
   }
 
   async #request(request) {
