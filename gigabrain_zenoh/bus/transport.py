@@ -24,7 +24,7 @@ class Link(NamedTuple):
     zid: str  # Zenoh's id of the other session
     name: str  # common name of its certificate; empty without one
     address: str
-    there: bool  # False once the link is closed
+    open: bool  # False once it is closed
 
 
 OnLink = Callable[[Link], None]

@@ -150,7 +150,7 @@ def bringup(name: Body, *, link: Literal["emulated", "real"] = "real", seconds: 
     for one in found:
         colour = {"ok": "green", "warning": "yellow", "error": "red"}[one.verdict]
         verdict = f"[{colour}]{one.verdict}[/{colour}]"
-        table.add_row(plain(one.what), verdict, plain(one.text), plain(one.do))
+        table.add_row(plain(one.what), verdict, plain(one.text), plain(one.remedy))
     Console().print(table)
     return int(any(one.verdict == "error" for one in found))
 

@@ -88,7 +88,7 @@ class GraphWatch:
             found.append(odd)
         for one in found:
             text = f"{one.topic}: {one.text}"[:MAX_TEXT]
-            yield Cause(code=f"ros2_{one.kind}", text=text, remedy=one.do)
+            yield Cause(code=f"ros2_{one.kind}", text=text, remedy=one.remedy)
         if text := self._moved():
             yield Cause(code="ros2_network", text=text[:MAX_TEXT], remedy=REJOIN)
         for offset_s in self._offsets_s():

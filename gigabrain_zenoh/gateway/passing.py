@@ -270,7 +270,7 @@ class Passage:
             ours=True,
         )
         found = troubles(self._link, (*theirs, ours), ours_only=True)
-        wrong = frozenset(f"{one.text}; {one.do}" for one in found)
+        wrong = frozenset(f"{one.text}; {one.remedy}" for one in found)
         for text in sorted(wrong - self._reported):
             log.warning("%s: %s", route.topic, text)
         self._reported = wrong

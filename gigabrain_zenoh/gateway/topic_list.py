@@ -56,7 +56,7 @@ def rows(
     endpoints = tuple(endpoints)
     wrong: dict[str, list[str]] = defaultdict(list)
     for one in troubles(link, endpoints):
-        wrong[one.topic].append(f"{one.text}; {one.do}")
+        wrong[one.topic].append(f"{one.text}; {one.remedy}")
     groups: dict[tuple[str, Kind, str], list[GraphEndpoint]] = defaultdict(list)
     for each in endpoints:
         shown = all_topics or not each.type.startswith(EVERY_NODE)

@@ -83,7 +83,7 @@ class ProcessType:
     forks: bool = False  # a fork server may import its module, which leaves no thread running
     stop_last: bool = False  # others need it for a clean end
     stops: bool = False  # carries commands and stops: gets a higher priority where permitted
-    repeats: bool = False  # can be replayed, so it publishes a log of its inputs
+    replayable: bool = False  # can be replayed, so it publishes a log of its inputs
     optional: bool = False  # the robot runs without it, also if its settings are wrong
     looks_on: bool = False  # the robot does not need it: receives in batches, at low priority
     prompt: bool = False  # carries requests for others: runs at normal priority, though `own`
@@ -206,7 +206,7 @@ async def _work(
 
         handler = logs.BusHandler(publish_log, config.name)
         logging.getLogger().addHandler(handler)
-        if process_type.repeats:
+        if process_type.replayable:
             publish = functools.partial(bus.publish, INPUT_LOG, name=config.name)
             bus.input_log = PublishedInputLogger(publish, bus.clock.unix_ns)
         try:

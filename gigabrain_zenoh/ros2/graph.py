@@ -36,7 +36,7 @@ class Trouble(NamedTuple):
     kind: str  # type, qos, hash, name or twice
     topic: str
     text: str
-    do: str  # the remedy
+    remedy: str
 
 
 async def discovered(

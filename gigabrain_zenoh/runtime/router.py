@@ -81,9 +81,9 @@ class RouterLink:
 
     def update(self, link: Link) -> None:
         """Update the state when the router's link comes or goes; other links use the socket."""
-        if link.address.startswith(SOCKET) or link.there == self.open.is_set():
+        if link.address.startswith(SOCKET) or link.open == self.open.is_set():
             return
-        if link.there:
+        if link.open:
             self.open.set()
             log.info("joined to the router at %s", self._router)
         else:
@@ -195,7 +195,7 @@ class AccessAudit:
     def note_link(self, link: Link) -> None:
         """Log that a client connected or left; add one without rights to the audit trail."""
         name = link.name or "a local process"
-        if not link.there:
+        if not link.open:
             if self._links.pop(link.zid, None):
                 log.info("%s at %s has left", name, link.address)
             return

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple, get_args
 from gigabrain_schemas.base import Message
 from gigabrain_schemas.topics import (
     DESCRIBE,
-    ESTOP_SAID,
+    ESTOP_TOPIC,
     HEALTH,
     LOG,
     PARAM,
@@ -101,7 +101,7 @@ LOCAL = "local"  # subject of clients on the router's Unix socket, which only th
 
 FLEET_WIDE: tuple[Role, ...] = ("operator", "viewer", "dispatcher")  # if they name no robot
 OF_ONE_ROBOT: tuple[Role, ...] = ("robot", "brain", "operator", "viewer", "dispatcher")
-PUBLISHED: tuple[Topic[Any], ...] = (*TOPICS, ESTOP_SAID)
+PUBLISHED: tuple[Topic[Any], ...] = (*TOPICS, ESTOP_TOPIC)
 Rule = dict[str, Any]
 
 

@@ -227,7 +227,7 @@ ESTOP = Service(
     "robot/estop", requests.EstopRequest, requests.GateReply, priority="real_time", callers=BOTH,
 )  # fmt: skip
 # for clients that can publish but not query: it also stops the robot, without a reply
-ESTOP_SAID = Topic(
+ESTOP_TOPIC = Topic(
     ESTOP.key, requests.EstopRequest, 10, priority="real_time", congestion="block", express=True,
     depth=16, max_bytes=KB, publishers=BOTH,
 )  # fmt: skip

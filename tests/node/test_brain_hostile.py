@@ -5,11 +5,11 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from gigabrain_schemas.topics import BUTTON, ESTOP_SAID, SAFETY, TELEOP
+from gigabrain_schemas.topics import BUTTON, ESTOP_TOPIC, SAFETY, TELEOP
 from gigabrain_zenoh.qa.faults.hostile import ExtremeMessage, chosen_extremes
 from gigabrain_zenoh.testing.in_memory import RobotInMemory
 
-STOPPING_TOPICS = (ESTOP_SAID, BUTTON, TELEOP, SAFETY)  # topics whose purpose is to stop the robot
+STOPPING_TOPICS = (ESTOP_TOPIC, BUTTON, TELEOP, SAFETY)  # topics whose purpose is to stop the robot
 # extreme values in these fields mean an accident, which latches the gate
 LATCHING_FIELDS = ("linear_acceleration", "orientation")
 TICKS_PER_S = 50

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 import zenoh
 
-from gigabrain_schemas.topics import ESTOP_SAID, SERVICES, TELEOP, TOPICS
+from gigabrain_schemas.topics import ESTOP_TOPIC, SERVICES, TELEOP, TOPICS
 from gigabrain_zenoh.config.settings import Endpoint
 from gigabrain_zenoh.security.authority import issue
 from gigabrain_zenoh.testing.processes import SampleCollector, repeat
@@ -25,7 +25,7 @@ MAY_QUERY = {
     "zones_change pose_set objects_change sim_change limp audit_log param/driver describe/driver",
     "viewer": "map_list audit_log describe/driver",
 }
-PUBLISHED_KEYS = [topic.at("perception") for topic in (*TOPICS, ESTOP_SAID)]
+PUBLISHED_KEYS = [topic.at("perception") for topic in (*TOPICS, ESTOP_TOPIC)]
 QUERIED_KEYS = [service.at("driver") for service in SERVICES]
 
 

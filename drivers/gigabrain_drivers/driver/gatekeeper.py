@@ -19,7 +19,7 @@ from gigabrain_schemas.requests import (
     LimpRequest,
     ReleaseRequest,
 )
-from gigabrain_schemas.topics import ENABLE, ESTOP, ESTOP_SAID, LIMP, RELEASE
+from gigabrain_schemas.topics import ENABLE, ESTOP, ESTOP_TOPIC, LIMP, RELEASE
 from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.clock import Clock
 from gigabrain_zenoh.codec import DECODE_ERRORS
@@ -189,7 +189,7 @@ class Gatekeeper:
         self._stop = stop
         self._bus.serve(ESTOP, self._on_estop)
         self._bus.subscribe(
-            ESTOP_SAID,
+            ESTOP_TOPIC,
             lambda _, request: self._stop_without_reply(request),
             self._on_undecodable_estop,
         )

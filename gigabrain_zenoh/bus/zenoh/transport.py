@@ -183,8 +183,8 @@ class ZenohTransport:
         def on_event(event: zenoh.LinkEvent) -> None:
             link = event.link
             name = link.auth_identifier or ""
-            there = event.kind == zenoh.SampleKind.PUT
-            on_link(Link(str(link.zid), name, str(link.dst), there))
+            is_open = event.kind == zenoh.SampleKind.PUT
+            on_link(Link(str(link.zid), name, str(link.dst), is_open))
 
         return self._lines.declare(
             lambda line: line.session.info.declare_link_events_listener(

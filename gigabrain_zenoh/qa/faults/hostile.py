@@ -22,7 +22,7 @@ from gigabrain_schemas.topics import (
     BODY,
     CMD_VEL,
     DESCRIBE,
-    ESTOP_SAID,
+    ESTOP_TOPIC,
     IMU,
     INTENT,
     MAP,
@@ -314,7 +314,7 @@ def decodes(message: ExtremeMessage) -> bool:
 
 
 def _all() -> tuple[Topic[Any] | Service[Any, Any], ...]:
-    return (*TOPICS, ESTOP_SAID, *SERVICES)
+    return (*TOPICS, ESTOP_TOPIC, *SERVICES)
 
 
 def _evenly(all_of: list[ExtremeMessage], count: int) -> list[ExtremeMessage]:

@@ -210,7 +210,7 @@ async def test_bringup_finds_no_fault_or_names_the_wrong_type(judge: Judge, tmp_
     found = await ros2_bringup.check(str(file), "real", tmp_path, 6.0)
     wrong = [each for each in found if each.verdict == "error"]
     assert [each.what for each in wrong] == ["/cmd_vel"]
-    assert wrong[0].do == "write topics: {command: {type: geometry_msgs/msg/Twist}}"
+    assert wrong[0].remedy == "write topics: {command: {type: geometry_msgs/msg/Twist}}"
     frames = [each.text for each in found if each.what == "scan frame"]
     assert frames
     assert "x -0.032 m" in frames[0]

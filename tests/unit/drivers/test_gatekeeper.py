@@ -12,7 +12,7 @@ from gigabrain_drivers.driver.gatekeeper import LatchFile
 from gigabrain_schemas.brain import CmdVel
 from gigabrain_schemas.logs import AuditRecord
 from gigabrain_schemas.requests import EnableRequest, EstopRequest, GateReply, ReleaseRequest
-from gigabrain_schemas.topics import AUDIT, CMD_VEL, ENABLE, ESTOP, ESTOP_SAID, RELEASE
+from gigabrain_schemas.topics import AUDIT, CMD_VEL, ENABLE, ESTOP, ESTOP_TOPIC, RELEASE
 from gigabrain_zenoh.runtime.audit import read_audit
 from gigabrain_zenoh.testing.in_memory import RobotInMemory
 from gigabrain_zenoh.testing.samples import TICK_NS
@@ -99,7 +99,7 @@ async def test_an_e_stop_that_is_said_and_not_asked_for_stops_just_the_same(
     async with RobotInMemory(tmp_path) as robot:
         await driving(robot)
         client = robot.network.transport()
-        client.publish(ESTOP_SAID, "robot/estop", payload, "")
+        client.publish(ESTOP_TOPIC, "robot/estop", payload, "")
         assert (await robot.go(1))[-1] == 0.0
         assert robot.mode == "latched"
     assert LatchFile(tmp_path).read().estop_generation == 1
@@ -109,7 +109,7 @@ async def test_garbage_that_is_said_on_the_key_of_the_e_stop_stops_nobody(tmp_pa
     async with RobotInMemory(tmp_path) as robot:
         await driving(robot)
         for payload in (b"\xc1", b"{", b'{"source": 3}', b"x" * 2000):
-            robot.network.transport().publish(ESTOP_SAID, "robot/estop", payload, "")
+            robot.network.transport().publish(ESTOP_TOPIC, "robot/estop", payload, "")
         assert (await robot.go(5))[-1] == pytest.approx(0.26)
 
 

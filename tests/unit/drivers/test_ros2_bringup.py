@@ -73,18 +73,18 @@ def test_the_remedy_for_an_empty_graph_names_domain_and_network() -> None:
     ours = endpoint("/cmd_vel", STAMPED, ours=True)
     (found,) = graph_findings(options(), [ours])
     assert (found.what, found.verdict) == ("graph", "error")
-    assert "ROS_DOMAIN_ID=7" in found.do
+    assert "ROS_DOMAIN_ID=7" in found.remedy
     zenoh = options(transport="rmw_zenoh", router="tcp/robot:7447")
     (found,) = graph_findings(zenoh, [])
-    assert "tcp/robot:7447" in found.do
-    assert "rmw_zenoh_cpp" in found.do
+    assert "tcp/robot:7447" in found.remedy
+    assert "rmw_zenoh_cpp" in found.remedy
 
 
 def test_a_missing_topic_is_named_with_others_of_its_type() -> None:
     endpoints = [endpoint("/robot1/odom", ODOMETRY), *GOOD_ENDPOINTS[1:]]
     found = only(graph_findings(options(), endpoints), "/odom")
     assert (found.verdict, found.text) == ("error", "it has no publisher")
-    assert "/robot1/odom; write it as topics.odometry.name, or set namespace" in found.do
+    assert "/robot1/odom; write it as topics.odometry.name, or set namespace" in found.remedy
     assert graph_findings(options(namespace="/robot1"), endpoints)[0].verdict == "ok"
 
 
@@ -95,17 +95,17 @@ def test_a_wrong_type_is_named() -> None:
     endpoints = [*GOOD_ENDPOINTS[:2], endpoint("/cmd_vel", TWIST, "subscriber")]
     found = only(graph_findings(options(), endpoints), "/cmd_vel")
     assert found.verdict == "error"
-    assert found.do == f"write topics: {{command: {{type: {TWIST}}}}}"
+    assert found.remedy == f"write topics: {{command: {{type: {TWIST}}}}}"
 
 
 def test_a_mismatched_quality_of_service_is_named() -> None:
     wanted = options(topics={"scan": {"qos": "reliable"}})
     found = only(graph_findings(wanted, GOOD_ENDPOINTS), "/scan")
     assert found.verdict == "error"
-    assert found.do == "write topics: {scan: {qos: best_effort}}"
+    assert found.remedy == "write topics: {scan: {qos: best_effort}}"
     wanted = options(topics={"command": {"type": STAMPED, "qos": "best_effort"}})
     found = only(graph_findings(wanted, GOOD_ENDPOINTS), "/cmd_vel")
-    assert found.do == "write topics: {command: {qos: reliable}}"
+    assert found.remedy == "write topics: {command: {qos: reliable}}"
     volatile = [*GOOD_ENDPOINTS, endpoint("/tf_static", TF)]
     found = only(graph_findings(options(mounting="tf_static"), volatile), "/tf_static")
     assert "volatile" in found.text
@@ -115,7 +115,7 @@ def test_a_robot_that_takes_no_commands_is_an_error_with_alternatives() -> None:
     endpoints = [*GOOD_ENDPOINTS[:2], endpoint("/base/cmd", TWIST, "subscriber")]
     found = only(graph_findings(options(), endpoints), "/cmd_vel")
     assert (found.verdict, found.text) == ("error", "no node takes commands")
-    assert "/base/cmd" in found.do
+    assert "/base/cmd" in found.remedy
     assert "/cmd_vel: no node takes commands" in explain(options(), endpoints)
 
 
@@ -172,7 +172,7 @@ def test_faulty_messages_are_named(wrong: TopicStatistics, verdict: str, text: s
     assert len(bad) == 1
     assert bad[0].verdict == verdict
     assert text in bad[0].text
-    assert bad[0].do
+    assert bad[0].remedy
 
 
 def test_an_imu_without_orientation_is_a_warning() -> None:
@@ -190,7 +190,7 @@ def test_an_imu_without_orientation_is_a_warning() -> None:
     (wrong,) = (each for each in found if each.verdict != "ok")
     assert (wrong.what, wrong.verdict) == ("/imu", "warning")
     assert wrong.text.startswith("it has no orientation")
-    assert "topics.imu.name" in wrong.do
+    assert "topics.imu.name" in wrong.remedy
 
 
 def tree(types: Types, x: float, yaw: float = 0.0) -> FrameTree:

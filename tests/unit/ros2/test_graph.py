@@ -20,7 +20,7 @@ def endpoint(node: str, kind: Any, type: str = SCAN, **other: Any) -> GraphEndpo
 
 
 def found(link: Ros2Link, *endpoints: GraphEndpoint) -> list[tuple[str, str, str]]:
-    return [(each.kind, each.text, each.do) for each in troubles(link, endpoints)]
+    return [(each.kind, each.text, each.remedy) for each in troubles(link, endpoints)]
 
 
 def test_matching_endpoints_have_no_trouble() -> None:

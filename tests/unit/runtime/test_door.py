@@ -56,7 +56,7 @@ class Rig:
         other.subscribe(AUDIT, lambda _key, record: self.received.append(record))
         self.trail = AuditTrail(self.bus, folder)
         self.door = AccessAudit(self.trail, {"viewer@red"})
-        self.door.note_link(Link(ZID, "viewer@red", "tls/127.0.0.1:5", there=True))
+        self.door.note_link(Link(ZID, "viewer@red", "tls/127.0.0.1:5", open=True))
 
 
 @pytest.mark.long

@@ -38,7 +38,7 @@ class Finding(NamedTuple):
     what: str  # a topic or frame
     verdict: Verdict
     text: str  # the result
-    do: str = ""  # the remedy
+    remedy: str = ""
 
 
 class Row(NamedTuple):
@@ -116,7 +116,7 @@ def rows(options: Ros2Options, lidar: Lidar | None = None) -> list[Row]:
 def explain(options: Ros2Options, endpoints: Sequence[GraphEndpoint]) -> str:
     """Return up to two errors of the graph with remedies, as one line; empty without errors."""
     wrong = [f for f in graph_findings(options, endpoints) if f.verdict == "error"]
-    return "; ".join(f"{each.what}: {each.text}; {each.do}" for each in wrong[:2])
+    return "; ".join(f"{each.what}: {each.text}; {each.remedy}" for each in wrong[:2])
 
 
 def graph_findings(

@@ -26,7 +26,7 @@ from gigabrain_schemas.topics import (
     DESCRIBE,
     ENABLE,
     ESTOP,
-    ESTOP_SAID,
+    ESTOP_TOPIC,
     GOAL,
     MAP_LOAD,
     MISSION,
@@ -60,7 +60,7 @@ from gigabrain_zenoh.qa.robot_under_test import RobotUnderTest, rss_mb
 
 # messages that may stop, take, cancel or misplace by their purpose: undone as a person would
 UNDONE = (
-    ESTOP, ESTOP_SAID, BUTTON, SAFETY, ENABLE, TELEOP, GOAL, MISSION, TASK_CHANGE, PARAM,
+    ESTOP, ESTOP_TOPIC, BUTTON, SAFETY, ENABLE, TELEOP, GOAL, MISSION, TASK_CHANGE, PARAM,
     MAP_LOAD, POSE_SET,
 )  # fmt: skip
 ACCIDENTS = {"collision", "tilted"}
