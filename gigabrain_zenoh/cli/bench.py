@@ -204,7 +204,7 @@ def bodies(
     check_names(names, [world])
     drives = {name: load_robot(name).description().has_base for name in names or simulated(link)}
     if fixed := [name for name in names if not drives[name]]:
-        raise ConfigError(f"{fixed[0]} has no base to drive")
+        raise ConfigError(f"{fixed[0]} has no base to drive; leave it out")
     chosen = [name for name, has_base in drives.items() if has_base]
     deployment = Deployment(
         link=link, world=world, seed=seed, resume="auto", router="tcp/127.0.0.1:0"

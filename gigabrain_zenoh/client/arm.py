@@ -118,7 +118,7 @@ class JointPath:
             if speed > joint.max_speed:
                 raise ConfigError(
                     f"trajectory: point {number}: {joint.name} would have to move at {speed:.2f}, "
-                    f"more than {joint.max_speed:g}"
+                    f"more than {joint.max_speed:g}; give it more time"
                 )
 
 

@@ -48,7 +48,7 @@ START_ROUTER = (
     "start the robot with `gigabrain up` or `gigabrain demo`, or name its router with --connect"
 )
 READ_SAFETY_LOG = "read its log with `gigabrain log --process safety`"
-GOES_ON = "remove the cause; decision then goes on by itself"
+GOES_ON = "remove the cause; decision then continues by itself"
 BY_HAND = "move it with `gigabrain teleop` or `gigabrain arm jog`"
 CHECK_LIDAR = "check the lidar's power and cable"
 
@@ -246,7 +246,7 @@ def _idle(tasks: TaskStatus | None) -> LinkStatus | None:
         return _waits("intent", f"{task.id} is paused: {task.reason}", remedy)
     if tasks.drives:
         return None
-    return _waits("intent", f"{task.id}: {tasks.doing}", "it goes on by itself after that step")
+    return _waits("intent", f"{task.id}: {tasks.doing}", "it continues by itself after that step")
 
 
 def _control(facts: ChainFacts) -> LinkStatus:

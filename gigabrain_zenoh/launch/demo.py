@@ -95,8 +95,8 @@ class Capacity:
 SYSTEMS = ("perception", "decision", "control")
 CHECK_S = 0.1  # period of checks
 RELEASE_FIRST = (
-    "a real body drives only after a person has released and enabled it: while the demo runs, in "
-    "another terminal, `gigabrain release` and `gigabrain enable`"
+    "a real body drives only after a person has released and enabled it: while the demo runs, "
+    "call `gigabrain release` and `gigabrain enable` in another terminal"
 )
 STALL_TIMEOUT_S = 60.0  # without a tick of the robot's clock
 REPORT_TIMEOUT_S, SHORT_TIMEOUT_S = 5.0, 0.2  # for processes' reports; the second after Ctrl-C

@@ -179,7 +179,7 @@ def _tree_problem(
 ) -> str:
     """Return the problem of a tree, if any; `depths` has the depth of each valid tree."""
     if name in above:
-        return f"is a cycle: {' → '.join((*above[above.index(name) :], name))}"
+        return f"is a cycle: {' → '.join((*above[above.index(name) :], name))}; remove a step"
     if name in depths:
         return ""
     if len(above) >= MAX_DEPTH:

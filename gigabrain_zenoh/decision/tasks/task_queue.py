@@ -182,7 +182,7 @@ class TaskQueue:
             job.context.may_let_go = True
             return f"{job.id} opens the gripper"
         if not job.held and job is not self._jobs[0]:
-            raise Refused(f"{job.id} waits for {self._jobs[0].id}; it goes on by itself after that")
+            raise Refused(f"{job.id} waits for {self._jobs[0].id}; it continues after that")
         if not job.held:
             raise Refused(f"{job.id} is not paused")
         job.held, job.why_held = False, ""

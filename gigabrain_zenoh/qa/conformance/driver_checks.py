@@ -183,7 +183,7 @@ def link_of(driver: Driver) -> TracedLine:
     """Return the driver's attribute `link`. Raises Skipped without one."""
     link: TracedLine | None = getattr(driver, "link", None)
     if link is None or not hasattr(link, "trace"):
-        raise Skipped("the driver keeps no line with a `trace` in `link`: no bytes to look at")
+        raise Skipped("the driver has no `link` with a `trace`, so its bytes cannot be checked")
     return link
 
 

@@ -275,7 +275,9 @@ async def driver_killed(robot: CheckedRobot) -> Finding:
     """Kill the driver by SIGKILL: the body stops by its own watchdog, or the driver's guard."""
     guard_ms = robot.driver().guard_ms
     if robot.goes_on and guard_ms is None:
-        raise Skipped(f"motors at zero {robot.promise}: they go on until a driver starts again")
+        raise Skipped(
+            f"motors at zero {robot.promise}: they keep turning until a driver starts again"
+        )
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
     child = await asyncio.create_subprocess_exec(
         *(sys.executable, "-P", "-m", __name__),
@@ -316,7 +318,7 @@ async def _until_stopped(gated: GatedDriver) -> None:
         return not any(gated.checked.commanded(gated.state))
 
     if await gated.until(stopped, QUIET_TICKS) is None:
-        raise Failed("connected again, and the motors go on")
+        raise Failed("connected again, but the motors keep turning")
 
 
 async def _cut_off(gated: GatedDriver, fault: str, reported_ms: float) -> Finding:
@@ -334,7 +336,7 @@ async def _cut_off(gated: GatedDriver, fault: str, reported_ms: float) -> Findin
     await _until_stopped(gated)
     late = times.get(REPORTED, math.inf) - reported_ms - SLACK_MS
     text = f"{REPORTED} after {times[REPORTED]:.0f} ms" if times else f"never {REPORTED}"
-    text += "; motors without a watchdog go on until the line is back"
+    text += "; motors without a watchdog keep turning until the line is back"
     return Finding(late <= 0, text, times, max(late, 0.0) if math.isfinite(late) else 0.0)
 
 

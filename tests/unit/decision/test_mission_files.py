@@ -71,11 +71,11 @@ from gigabrain_zenoh.errors import ConfigError
         (
             "trees:\n  a: [{tree: b}]\n  b: [{retry: {times: 2, do: [{tree: a}]}}]\n"
             "do: [{tree: a}]",
-            "m:2: trees.a: is a cycle: a → b → a",
+            "m:2: trees.a: is a cycle: a → b → a; remove a step",
         ),
         (
             "trees:\n  a: [{tree: a}]\ndo: [{wait: 1}]",
-            "m:2: trees.a: is a cycle: a → a",
+            "m:2: trees.a: is a cycle: a → a; remove a step",
         ),
         ("do:\n- check: nonsense", "m:2: do[0].check: expected a field, one of < <= > >= == != "),
         (

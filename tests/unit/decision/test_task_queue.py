@@ -59,7 +59,7 @@ def test_resuming_a_task_that_waits_names_the_active_one(robot: Robot) -> None:
     robot.tasks.add_goal(Goal(x=3.0, y=0.0), "queue", "bob")
     assert [one.state for one in robot.status.queue] == ["paused", "queued"]
     for name in ("goal-1", "goal-3"):
-        with pytest.raises(Refused, match=f"{name} waits for goal-2; it goes on by itself"):
+        with pytest.raises(Refused, match=f"{name} waits for goal-2; it continues after that"):
             robot.tasks.resume(name)
     with pytest.raises(Refused, match="goal-2 is not paused"):
         robot.tasks.resume("")

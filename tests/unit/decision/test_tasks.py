@@ -101,7 +101,7 @@ async def test_missions_are_checked_before_they_are_accepted(site: Site, tmp_pat
     await site.step()
     for text, why in (
         ("do:\n- gotoo: a", "tea:2: unknown field 'gotoo'; did you mean 'goto'?"),
-        ("trees: {a: [{tree: a}]}\ndo: [{tree: a}]", "is a cycle: a → a"),
+        ("trees: {a: [{tree: a}]}\ndo: [{tree: a}]", "is a cycle: a → a; remove a step"),
         (
             "do: [{script: {run: beep}}]",
             "script 'beep': this robot runs no scripts; name their folder",

@@ -205,7 +205,7 @@ async def test_a_servo_that_starts_again_is_caught_and_named() -> None:
         before = rig.joint(LIFT).position
         rig.servo(LIFT).power_on()
         await rig.wait(200)
-        with pytest.raises(BodyLost, match=r"servo 2 \(shoulder_lift\) had let go by itself"):
+        with pytest.raises(BodyLost, match=r"servo 2 \(shoulder_lift\) had switched itself off"):
             await rig.driver.read_state()
         assert rig.servo(LIFT)[feetech.TORQUE] == 1
         assert abs(rig.joint(LIFT).position - before) < math.radians(10)

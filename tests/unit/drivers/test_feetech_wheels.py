@@ -212,7 +212,7 @@ async def test_a_wheels_servo_that_starts_again_ends_the_driver() -> None:
     async with opened(rig):
         await rig.drive(300, 0.2, 0.0, 0.0)
         rig.arm.wheels["left"].power_on()
-        with pytest.raises(BodyLost, match=r"servo 7 \(wheel left\) had let go by itself"):
+        with pytest.raises(BodyLost, match=r"servo 7 \(wheel left\) had switched itself off"):
             await rig.drive(300, 0.2, 0.0, 0.0)
 
 

@@ -353,7 +353,7 @@ class FeetechDriver(Driver):
         await self._bus.send(feetech.sync_write(address, {joint.id: settings}))
         caught = await self._bus.write(joint.id, feetech.TORQUE, 1)
         text = "it holds again" if caught else "and it could not be switched on again"
-        raise BodyLost(f"{joint} had let go by itself, {text}: is its supply too weak?")
+        raise BodyLost(f"{joint} had switched itself off, {text}: is its supply too weak?")
 
     async def _send_settings(self, now_ns: int) -> None:
         """Write settings to servos that lack them, as after a disturbed write."""

@@ -291,7 +291,7 @@ class ServoBase:
             await self._bus.send(feetech.sync_write(feetech.ACCELERATION.address, parts))
         for wheel in self.wheels:
             if wheel.let_go and not wheel.status:
-                raise BodyLost(f"{wheel} had let go by itself: is its supply too weak?")
+                raise BodyLost(f"{wheel} had switched itself off: is its supply too weak?")
         return len(parts)
 
     @property

@@ -166,7 +166,7 @@ class RosLink:
             self.errors += 1
             fault.begin(f"{topic}: a message was dropped: {error}")
         else:
-            fault.end(f"{topic}: its messages are good again")
+            fault.end(f"{topic}: its messages are valid again")
 
     def _log_message(self, way: str, topic: str, type: str, payload: bytes) -> None:
         if self.trace:
