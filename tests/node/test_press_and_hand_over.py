@@ -74,7 +74,7 @@ def test_a_press_without_contact_fails_and_backs_off(tmp_path: Path) -> None:
     )
     rig.manipulator.close()
     assert (state, depth) == ("failed", 0.0)
-    assert reason.endswith(": nothing was touched, 2 cm behind that place")
+    assert reason.endswith(": nothing was touched up to 2 cm behind that place")
     tool = rig.planner.arm.forward(
         np.array([rig.arm.measured(name) for name in rig.planner.arm.names])
     )

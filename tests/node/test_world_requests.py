@@ -120,9 +120,7 @@ async def test_a_robot_stops_for_a_box_added_in_its_way(tmp_path: Path) -> None:
 async def test_a_refused_request_has_a_reason_and_is_not_logged(tmp_path: Path) -> None:
     _, driver = catalog.make_driver("turtlebot3_waffle", Run(folder=Path(), world="arena"))
     async with running_robot(driver, tmp_path) as (network, operator):
-        assert (await ask(operator, do="remove", name="box9")).text.startswith(
-            "nothing called 'box9'"
-        )
+        assert (await ask(operator, do="remove", name="box9")).text.startswith("no object 'box9'")
         assert "outside the world" in (await ask(operator, do="add", thing=Thing(x=50.0))).text
         assert not (await ask(operator, do="add")).ok
     assert not payloads_on(network, REQUEST_LOG.key)

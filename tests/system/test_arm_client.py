@@ -185,7 +185,7 @@ async def test_the_tools_report_no_missing_scans_worlds_or_wheels(
     ("words", "text"),
     [
         (("jog", "wrist", "10"), "no joint 'wrist'"),
-        (("jog", "wrist_roll", "1000"), "wrist_roll: it goes from -157.2 to 162.8 °, not to"),
+        (("jog", "wrist_roll", "1000"), "wrist_roll: expected a goal from -157.2 to 162.8 °, got"),
         (("jog", "wrist_roll", "nan"), "expected a number, got nan"),
         (("limp",), "--yes"),
     ],

@@ -21,7 +21,7 @@ def test_without_a_yes_nothing_is_done(
 ) -> None:
     monkeypatch.setattr(sys, "stdin", Typed(typed))
     arm.limp()
-    assert capsys.readouterr().out == f"{arm.LIMP_PROMPT}nothing is done\n"
+    assert capsys.readouterr().out == f"{arm.LIMP_PROMPT}nothing was done\n"
 
 
 @pytest.mark.parametrize("typed", ["yes\n", " YES \n", "yes"])

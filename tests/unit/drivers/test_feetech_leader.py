@@ -129,7 +129,7 @@ async def test_silence_of_a_third_of_a_second_leaves_its_last_posture() -> None:
 async def test_one_servo_that_falls_silent_is_named() -> None:
     async with leading() as rig:
         rig.arm.bus.servos.remove(rig.servo("elbow_flex"))
-        with pytest.raises(ConfigError, match=r"servo 3 \(elbow_flex\) answers no more"):
+        with pytest.raises(ConfigError, match=r"servo 3 \(elbow_flex\) no longer answers"):
             await rig.read_on()
 
 

@@ -164,11 +164,11 @@ def test_a_key_gets_fields_json_or_cdr_of_ros() -> None:
     assert of("fields", string("hi")) == b'{"data":"hi"}'
     assert of("json", string('{"a": 1}')) == b'{"a": 1}'
     assert of("cdr", string("hi")) == string("hi")
-    with pytest.raises(BadPayload, match="no JSON"):
+    with pytest.raises(BadPayload, match="not JSON"):
         of("json", string("hi"))
     with pytest.raises(BadPayload, match="at most 1048576"):
         of("fields", string("x" * 1_048_577))
-    with pytest.raises(BadPayload, match="no CDR"):
+    with pytest.raises(BadPayload, match="not CDR"):
         of("fields", b"")
 
 

@@ -96,7 +96,7 @@ def test_over_dds_nodes_of_humble_have_neither_name_nor_hash() -> None:
     odd = endpoint("", "publisher", hash="")
     known = nameless(DDS, [odd, endpoint("/a", "publisher")])
     assert known
-    assert known.do == "if they run Humble, set distro: humble"
+    assert known.remedy == "if they run Humble, set distro: humble"
     assert nameless(DDS, [endpoint("/a", "publisher", hash=""), endpoint("", "publisher")]) is None
     assert nameless(RMW, [odd]) is None
     assert nameless(Ros2Link(transport="dds", distro="humble"), [odd]) is None

@@ -361,7 +361,7 @@ def payloads_with_long_sequences() -> Iterator[bytes]:
 
 
 def test_a_payload_beyond_the_limit_is_rejected(types: Types) -> None:
-    with pytest.raises(BadPayload, match="no CDR"):
+    with pytest.raises(BadPayload, match="not CDR"):
         types.decode("sensor_msgs/msg/Image", b"\0\1\0\0" + bytes((64 << 20) + 1))
 
 

@@ -39,7 +39,7 @@ def test_pictures_become_arrays_in_blue_green_and_red() -> None:
         (image(JPEG, width=66), "64 x 48 pixels; its message says 66 x 48"),
         (image(claiming(60000, 60000)), "its message says"),
         (image(claiming(16000, 16000), width=16000, height=16000), "at most 16000000 are read"),
-        (image(bytes(2 * 64 * 48), "depth16"), "depth16 is no picture"),
+        (image(bytes(2 * 64 * 48), "depth16"), "depth16 is not a colour picture"),
     ],
 )
 def test_a_broken_or_enormous_picture_is_refused_before_it_is_unpacked(
