@@ -7,6 +7,7 @@ import pytest
 from gigabrain_drivers.driver.catalog import load_robot, robot_path
 from gigabrain_schemas.base import Pose, Velocity
 from gigabrain_schemas.body import Joint, RobotState
+from gigabrain_zenoh.decision.arm_readings import ArmReading
 from gigabrain_zenoh.decision.arm_work import WorkInputs, work_for
 from gigabrain_zenoh.decision.tasks.arm_steps import Reach
 from gigabrain_zenoh.errors import ConfigError
@@ -74,8 +75,9 @@ def test_an_arm_lying_on_the_table_can_leave_it() -> None:
     state = RobotState(
         robot_type="so101", pose=here, velocity=Velocity(), joints=joints, joints_sent=LYING
     )
-    now = WorkInputs(state=state, body=body, things={}, hold=None, misses=0, drives=False)
-    work = work_for(planner, Reach(at=(0.2, 0.0, 0.15)), now)
+    arm = ArmReading(planner, body, state)
+    now = WorkInputs(arm=arm, things={}, hold=None, misses=0, drives=False)
+    work = work_for(Reach(at=(0.2, 0.0, 0.15)), now)
     assert not isinstance(work, str)
     assert isinstance(work(), Plan)
 

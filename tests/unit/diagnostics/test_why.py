@@ -140,7 +140,7 @@ async def test_an_unplugged_body_is_named_before_all_that_follows_from_it(tmp_pa
     gone = LinkHealth(connected=False, age_ms=2400)
 
     async def do(robot: RobotInMemory) -> None:
-        robot.body._look = lambda: None  # type: ignore[method-assign]
+        robot.body._scan = lambda: None  # type: ignore[method-assign]
         telling(robot, lambda state: replace(state, link=gone))
 
     found = await broken(tmp_path, do)
@@ -150,14 +150,14 @@ async def test_an_unplugged_body_is_named_before_all_that_follows_from_it(tmp_pa
 
 def seeing(robot: RobotInMemory, ranges: float) -> None:
     """From now on the lidar sees nothing but this distance [m], about."""
-    look = robot.body._look
+    look = robot.body._scan
 
     def other() -> LaserScan | None:
         scan = look()
         noise = np.linspace(0.0, 0.005, robot.body.robot.lidar.beams)  # type: ignore[union-attr]
         return scan and replace(scan, ranges=ranges_bytes(ranges + noise))
 
-    robot.body._look = other  # type: ignore[method-assign]
+    robot.body._scan = other  # type: ignore[method-assign]
 
 
 async def test_a_blind_lidar_is_named(tmp_path: Path) -> None:
@@ -170,7 +170,7 @@ async def test_a_blind_lidar_is_named(tmp_path: Path) -> None:
 
 async def test_a_lidar_that_sends_nothing_is_named(tmp_path: Path) -> None:
     async def do(robot: RobotInMemory) -> None:
-        robot.body._look = lambda: None  # type: ignore[method-assign]
+        robot.body._scan = lambda: None  # type: ignore[method-assign]
 
     found = await broken(tmp_path, do)
     assert found[:3] == ("scan", 13, "no scan has arrived")
