@@ -118,7 +118,7 @@ def test_the_body_avoids_a_disc_that_comes_head_on(speed: float) -> None:
     assert math.hypot(drive.pose.x - 3.0, drive.pose.y) < 0.15
     said = {plan.reason.partition(":")[0] for plan in drive.plans}
     assert said & {"going round", "waiting", "backing out"}
-    assert any("somebody" in plan.reason for plan in drive.plans)
+    assert any("a moving obstacle" in plan.reason for plan in drive.plans)
 
 
 def test_an_enclosed_body_reports_that_it_is_blocked() -> None:
