@@ -112,7 +112,9 @@ async def test_one_lost_answer_does_not_end_it_and_silence_does() -> None:
         before = await rig.read()
         rig.link.disturb = lambda _: b""
         assert await rig.read() == before
-        with pytest.raises(ConfigError, match=r"the leader at memory: servo 1 \(shoulder_pan\) an"):
+        with pytest.raises(
+            ConfigError, match=r"memory: servo 1 \(shoulder_pan\) no longer answers"
+        ):
             await rig.read_on()
 
 

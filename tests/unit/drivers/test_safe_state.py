@@ -108,8 +108,8 @@ async def test_a_body_that_is_lost_meanwhile_is_reported_and_closed(
 @pytest.mark.parametrize(
     ("state", "complaint"),
     [
-        ("park", "safe_state: park is more than MockBody can do; expected one of: stop, hold"),
-        ("limp", "safe_state: limp is more than MockBody can do; expected one of: stop, hold"),
+        ("park", "safe_state: park is not supported by MockBody; expected one of: stop, hold"),
+        ("limp", "safe_state: limp is not supported by MockBody; expected one of: stop, hold"),
     ],
 )
 async def test_a_driver_that_lacks_it_is_refused_at_the_start(

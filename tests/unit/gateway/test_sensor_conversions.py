@@ -168,7 +168,7 @@ def test_poses_of_ros_are_read_in_map_and_odom():
         (ros_pose(w=0.0), "map", "quaternion"),
         (ros_pose(), "base_link", "frame 'base_link'"),
         (ros_pose(), "", "frame ''"),
-        (ros_pose(), "odom", "not known"),
+        (ros_pose(), "odom", "a goal in odom needs a localized robot"),
     ],
 )
 def test_poses_that_cannot_be_goals_are_refused_with_the_reason(ros, frame, text):

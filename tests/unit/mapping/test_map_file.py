@@ -174,7 +174,9 @@ def test_a_graph_with_other_values_than_numbers_is_refused_in_one_line(
     unusable: NDArray[Any], path: Path
 ) -> None:
     np.savez(path.with_suffix(".graph.npz"), poses=unusable, allow_pickle=False)
-    with pytest.raises(ConfigError, match=r"npz: cut or damaged: poses holds something"):
+    with pytest.raises(
+        ConfigError, match=r"npz: cut or damaged: poses holds data other than numbers"
+    ):
         map_file.load_graph(path)
 
 
