@@ -106,7 +106,7 @@ async def test_zones_are_published_saved_with_the_map_and_loaded_with_it() -> No
         ),
         (
             Zone(name="lab", kind="keepout", points=((0, 0), (1, 1), (1, 0))),
-            "'lab' is there already; replace it (--replace), or choose another name",
+            "'lab' exists already; replace it (--replace), or choose another name",
         ),
         (
             Zone(name="dot", kind="one_way", points=((1, 1), (1, 1)), lane_width=1.0),
