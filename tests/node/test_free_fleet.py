@@ -207,7 +207,7 @@ async def test_topics_without_subscribers_are_not_encoded():
 @pytest.mark.parametrize(
     ("payload", "reason"),
     [
-        (b"", "no CDR: 0 bytes"),
+        (b"", "not CDR: 0 bytes"),
         (b"\x00\x01\x00\x00\x01", "Request: "),
         (b"\x00\x01\x00\x00" + bytes(MAX_COMMAND), "expected at most 65536"),
     ],

@@ -96,7 +96,7 @@ async def test_goal_pose_is_a_goal_in_map_or_odom():
     ("frame", "pose", "words"),
     [
         ("base_link", THERE, "frame 'base_link'"),
-        ("odom", THERE, "not known"),
+        ("odom", THERE, "a goal in odom needs a localized robot"),
         ("map", {"position": {"x": math.nan}}, "position"),
     ],
 )

@@ -14,8 +14,8 @@ from gigabrain_zenoh.testing.processes import SampleCollector, repeat
 from tests.system.keys import Site, make_fleet, raw, site
 
 MAY_PUBLISH = {
-    "brain": "world perceived/perception detections objects solids pose map zones intent task "
-    "arm_plan request_log input_log/perception health/perception log estop",
+    "brain": "world perceived/perception detections labels/perception objects solids pose map "
+    "zones intent task arm_plan request_log input_log/perception health/perception log estop",
     "operator": "teleop joint_teleop cmd_vel joint_cmd button log estop",
     "viewer": "",
 }
