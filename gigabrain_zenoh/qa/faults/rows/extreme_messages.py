@@ -37,6 +37,7 @@ from gigabrain_schemas.topics import (
     TASK_CHANGE,
     TELEOP,
     TOPICS,
+    ZONES,
     Topic,
 )
 from gigabrain_zenoh.bus.zenoh.transport import ZenohTransport
@@ -61,7 +62,7 @@ from gigabrain_zenoh.qa.robot_under_test import RobotUnderTest, rss_mb
 # messages that may stop, take, cancel or misplace by their purpose: undone as a person would
 UNDONE = (
     ESTOP, ESTOP_TOPIC, BUTTON, SAFETY, ENABLE, TELEOP, GOAL, MISSION, TASK_CHANGE, PARAM,
-    MAP_LOAD, POSE_SET,
+    MAP_LOAD, POSE_SET, ZONES,
 )  # fmt: skip
 ACCIDENTS = {"collision", "tilted"}
 LOOK_TICKS = 7  # until a message has gone the whole way: more than a scan
