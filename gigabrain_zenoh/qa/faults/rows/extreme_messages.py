@@ -19,6 +19,7 @@ import msgspec
 from msgspec import Struct
 
 from gigabrain_schemas.requests import DescribeRequest, EnableRequest, ParamRequest
+from gigabrain_schemas.sim import SimRequest
 from gigabrain_schemas.tasks import MissionRequest
 from gigabrain_schemas.topics import (
     BUTTON,
@@ -34,6 +35,7 @@ from gigabrain_schemas.topics import (
     POSE,
     POSE_SET,
     SAFETY,
+    SIM_CHANGE,
     TASK_CHANGE,
     TELEOP,
     TOPICS,
@@ -42,6 +44,7 @@ from gigabrain_schemas.topics import (
 )
 from gigabrain_zenoh.bus.zenoh.transport import ZenohTransport
 from gigabrain_zenoh.client.objects import set_pose
+from gigabrain_zenoh.client.requests import change_world
 from gigabrain_zenoh.errors import BodyLost, Refused
 from gigabrain_zenoh.gate.state import BRAIN
 from gigabrain_zenoh.geometry.pose import relative
@@ -62,7 +65,7 @@ from gigabrain_zenoh.qa.robot_under_test import RobotUnderTest, rss_mb
 # messages that may stop, take, cancel or misplace by their purpose: undone as a person would
 UNDONE = (
     ESTOP, ESTOP_TOPIC, BUTTON, SAFETY, ENABLE, TELEOP, GOAL, MISSION, TASK_CHANGE, PARAM,
-    MAP_LOAD, POSE_SET, ZONES,
+    MAP_LOAD, POSE_SET, SIM_CHANGE, ZONES,
 )  # fmt: skip
 ACCIDENTS = {"collision", "tilted"}
 LOOK_TICKS = 7  # until a message has gone the whole way: more than a scan
@@ -276,7 +279,7 @@ class ExtremeSender:
             await until(condition, "as before", within_s)
 
     async def _undo(self) -> None:
-        """Release, enable, localize, reset parameters, restart the mission, as a person would."""
+        """Release, enable, clear the world, localize, reset parameters, restart the mission."""
         robot, bus = self._robot, self._probe.bus
         with contextlib.suppress(TimeoutError, Refused):
             async with asyncio.timeout(AGAIN_S):
@@ -285,11 +288,18 @@ class ExtremeSender:
                 request = EnableRequest(source=BRAIN, take=True, by="a person")
                 while not any(one.ok for one in await bus.ask(ENABLE, request)):
                     await self._probe.ticks(2)
+        await self._clear_world()
         await self._localize()
         for name, value in self._params.items():
             with contextlib.suppress(Refused):
                 await bus.ask(PARAM, ParamRequest(name=name, value=value), name="decision")
         await self._start_mission()
+
+    async def _clear_world(self) -> None:
+        """Remove the objects that were added to the simulated world."""
+        with contextlib.suppress(BodyLost, Refused):
+            for thing in (await change_world(self._probe.bus, SimRequest())).things:
+                await change_world(self._probe.bus, SimRequest(do="remove", name=thing.name))
 
     async def _localize(self) -> None:
         """Set the robot's true pose where perception does not know it."""
