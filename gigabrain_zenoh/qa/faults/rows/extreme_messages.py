@@ -188,15 +188,15 @@ class ExtremeSender:
         """Send one message; return its effect."""
         loop, before = asyncio.get_running_loop(), self._robot.pids
         held_mb = {name: _held_mb(pid) for name, pid in before.items()}
-        began_s = loop.time()
+        own, began_s = self._newest.get(message.key), loop.time()
         self._send(message)
-        with contextlib.suppress(TimeoutError):
-            async with asyncio.timeout(ANSWER_S):
-                await self._probe.ticks(LOOK_TICKS)
+        await self._let_spread()
         silent = await self._silent(before)
         await self._until(lambda: self._drives() or message.to in UNDONE or self._accident())
         undone = message.to in UNDONE or (not self._drives() and self._accident())
-        began_s = loop.time() if undone else began_s
+        if undone:
+            await self._has_taken_effect(message, own)
+            began_s = loop.time()
         for _ in range(UNDO_ATTEMPTS if undone else 0):
             await self._undo()
             await self._until(self._drives, AGAIN_S)
@@ -217,6 +217,20 @@ class ExtremeSender:
             again_s=round(again_s, 2),
             undone=undone,
         )
+
+    async def _has_taken_effect(self, message: ExtremeMessage, own: bytes | None) -> None:
+        """Wait for the answer, or until the robot's `own` message has replaced the extreme one."""
+        if self._asking:
+            await asyncio.wait(self._asking, timeout=ANSWER_S)
+            await self._let_spread()
+        if own is not None:
+            await self._until(lambda: self._newest.get(message.key) is not own, AGAIN_S)
+
+    async def _let_spread(self) -> None:
+        """Wait until all processes can have reacted."""
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(ANSWER_S):
+                await self._probe.ticks(LOOK_TICKS)
 
     async def _growth(
         self, held_mb: dict[str, float], now: dict[str, int], ended: tuple[str, ...]
