@@ -185,13 +185,13 @@ class Recognition:
         bus.publish(DETECTIONS, found, basis=picture.basis, stamp_ns=picture.stamp_ns)
 
     def _publish_labels(self, state: RobotState) -> None:
-        """Publish the net's classes if they are due; a net with too many stays unnamed."""
+        """Publish the net's classes if they are due, unless there are none or too many."""
         boot, tick = self._labels_at
         if state.boot == boot and 0 <= state.tick - tick < LABELS_TICKS:
             return
         self._labels_at = state.boot, state.tick
         labels = self._observer.labels
-        if len(labels) <= MAX_LABELS:
+        if 0 < len(labels) <= MAX_LABELS:
             self._bus.publish(LABELS, Labels(labels=labels), name=self._bus.process)
 
     def _body_pose(self, boot: int, tick: int) -> Pose | None:

@@ -2,7 +2,7 @@
 
 It announces itself, discovers the other participants (SPDP) and their endpoints (SEDP), and matches
 those with its own. Source: OMG DDSI-RTPS 2.3, chapter 8.5. Data of a participant are accepted only
-from an address that it announces, so that nobody can make us send to a third host.
+from an address that it announces, so that no host can make it send to a third one.
 """
 
 from collections.abc import Callable, Collection, Iterable

@@ -163,5 +163,5 @@ def test_the_gripper_lets_go_on_request(offering: Rig) -> None:
 def test_a_thing_that_nobody_takes_is_kept_and_the_step_fails(offering: Rig) -> None:
     task = offering.run_until_done()
     assert task.state == "failed"
-    assert task.reason == "nobody took cube within 8 s; the gripper still holds it"
+    assert task.reason == "no person took cube within 8 s; the gripper still holds it"
     assert offering.arm.thing()[2] > 0.12

@@ -361,6 +361,17 @@ async def test_the_classes_of_the_net_are_published_once_a_second():
         assert [message.tick for _, message in received] == [90, 140]
 
 
+async def test_a_net_that_names_no_class_publishes_no_labels():
+    """Otherwise decision would refuse the labels of any other recogniser."""
+    async with running() as robot:
+        received: list[Labels] = []
+        robot.bus.subscribe(LABELS, lambda _key, message: received.append(message))
+        robot.net.classes = ("",)
+        robot.publish_state(90)
+        await settle()
+        assert received == []
+
+
 def test_a_class_without_a_name_or_named_twice_is_published_once_or_never():
     net = BallNet()
     net.classes = ("can", "", "ball", "can")

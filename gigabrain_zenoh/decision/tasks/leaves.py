@@ -204,7 +204,7 @@ class OfferNode(ArmNode):
             held = self.context.hand.held
             name = held.name if isinstance(held, HeldThing) else "it"
             return self.failed(
-                f"nobody took {name} within {self._seconds:g} s; the gripper still holds it"
+                f"no person took {name} within {self._seconds:g} s; the gripper still holds it"
             )
         self.context.offers = True
         return Status.RUNNING

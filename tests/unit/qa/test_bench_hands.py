@@ -1,4 +1,4 @@
-"""How `gigabrain bench hands` judges an arm by the physics."""
+"""Limits that `gigabrain bench hands` checks by the physics of an arm."""
 
 from types import SimpleNamespace
 from typing import cast
