@@ -102,11 +102,14 @@ class Bridge:
         self._waker = waker()
         self._loop.add_reader(self._waker.fileno(), self._drain)
 
-    def post(self, function: Callable[[Any], object], argument: Any) -> None:
-        """Let the loop call `function(argument)`. Never blocks; may be called from any thread."""
+    def post(self, function: Callable[[Any], object], argument: Any, *, lazy: bool = False) -> None:
+        """Let the loop call `function(argument)`. Never blocks; may be called from any thread.
+
+        A `lazy` call does not wake the loop. It waits for the next post that does.
+        """
         if self._open:
             self._queue.append((function, argument))
-            if not self._signalled:
+            if not (lazy or self._signalled):
                 self._wake()
 
     def close(self) -> None:
@@ -153,8 +156,15 @@ class Mailbox(Generic[T]):
     readable one.
     """
 
-    def __init__(self, bridge: Bridge, on_sample: Callable[[T], bool | None], depth: int) -> None:
-        self._bridge, self._on_sample = bridge, on_sample
+    def __init__(
+        self,
+        bridge: Bridge,
+        on_sample: Callable[[T], bool | None],
+        depth: int,
+        *,
+        lazy: bool = False,
+    ) -> None:
+        self._bridge, self._on_sample, self._lazy = bridge, on_sample, lazy
         self._newest_only = depth == 1
         self._size = SPARE_SAMPLES if self._newest_only else depth
         self._queues: dict[str, deque[T]] = {}
@@ -162,14 +172,17 @@ class Mailbox(Generic[T]):
         self._posted = False
 
     def put(self, sample: T, key: str = "") -> None:
-        """Store a sample and wake the event loop. Never blocks; may be called from any thread."""
+        """Store a sample and wake the event loop, unless the mailbox is lazy.
+
+        Never blocks; may be called from any thread.
+        """
         queue = self._queues.get(key)
         if queue is None:
             queue = self._add(key)
         queue.append(sample)
         if not self._posted:
             self._posted = True
-            self._bridge.post(Mailbox._deliver, self)
+            self._bridge.post(Mailbox._deliver, self, lazy=self._lazy)
 
     def _add(self, key: str) -> deque[T]:
         with self._adding:

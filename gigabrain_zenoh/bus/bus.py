@@ -125,16 +125,24 @@ class Bus:
         return stamped
 
     def latest(
-        self, topic: Topic[M], on_new: Callable[[M], None] | None = None, *, name: str = "*"
+        self,
+        topic: Topic[M],
+        on_new: Callable[[M], None] | None = None,
+        *,
+        name: str = "*",
+        lazy: bool = False,
     ) -> Latest[M]:
-        """Keep the newest message on `topic`; `on_new` is called with each new one."""
+        """Keep the newest message on `topic`; `on_new` is called with each new one.
+
+        See `subscribe` for `lazy`.
+        """
         latest = Latest(topic, self.clock, self.time)
 
         def receive(_key: str, message: M) -> None:
             if latest.store(message) and on_new:
                 on_new(message)
 
-        self.subscribe(topic, receive, name=name)
+        self.subscribe(topic, receive, name=name, lazy=lazy)
         return latest
 
     def subscribe(
@@ -144,9 +152,12 @@ class Bus:
         on_bad: Callable[[bytes], None] | None = None,
         *,
         name: str = "*",
+        lazy: bool = False,
     ) -> Close:
         """Call `on_message(key, message)` for each message, `on_bad(payload)` for invalid ones.
 
+        Lazy messages do not wake the process. It receives them, in the order of their arrival,
+        before the next message that does: for what is only read when the node steps.
         Returns a function that ends the subscription.
         """
         decode, pattern = Codec(topic.type, topic.max_bytes).decode, topic.at(name)
@@ -176,7 +187,7 @@ class Bus:
             has_value = True
             return True
 
-        unsubscribe = self.transport.subscribe(pattern, receive, topic.depth)
+        unsubscribe = self.transport.subscribe(pattern, receive, topic.depth, lazy=lazy)
         if topic.keep and not topic.many:
             unsubscribe = self._fetch_kept(topic, receive, lambda: has_value, unsubscribe)
         return self._add_subscription(pattern, unsubscribe)

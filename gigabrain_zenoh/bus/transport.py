@@ -42,11 +42,12 @@ class Transport(Protocol):
         """Deliver to all listeners on `key` with the topic's QoS, without waiting for any."""
         ...
 
-    def subscribe(self, key: str, on_sample: OnSample, depth: int) -> Close:
+    def subscribe(self, key: str, on_sample: OnSample, depth: int, *, lazy: bool = False) -> Close:
         """Call `on_sample` for each sample on `key`; a busy loop keeps the newest `depth` samples.
 
         For a pattern, `depth` is per key. With a depth of one, it keeps the newest sample
-        for which `on_sample` does not return False.
+        for which `on_sample` does not return False. Lazy samples do not wake the loop: they are
+        delivered before the next sample that does.
         """
         ...
 
@@ -164,8 +165,8 @@ class LocalTransport:
         self._network.sent.append((key, payload))
         self._network.deliver(key, payload)
 
-    def subscribe(self, key: str, on_sample: OnSample, depth: int) -> Close:
-        """Register a listener."""
+    def subscribe(self, key: str, on_sample: OnSample, depth: int, *, lazy: bool = False) -> Close:
+        """Register a listener; `lazy` has no effect, as samples never wait here."""
         self._closers.append(self._network.listen(key, on_sample))
         return self._closers[-1]
 

@@ -127,9 +127,10 @@ class ContextSource:
         if body and not self._subscribed_commands:
             self._subscribed_commands = True
             if body.description.has_base:
-                self._bus.subscribe(command_topic(body.description), self._on_command)
+                topic = command_topic(body.description)
+                self._bus.subscribe(topic, self._on_command, lazy=True)
             if body.description.joints:
-                self._bus.subscribe(JOINT_CMD, self._on_joint_command)
+                self._bus.subscribe(JOINT_CMD, self._on_joint_command, lazy=True)
 
     def at_scan(
         self, state: RobotState, world: WorldModel | None, verdict: SafetyState | None

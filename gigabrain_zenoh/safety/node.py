@@ -185,12 +185,13 @@ class InputCollector:
         self.bodies = bus.latest(BODY, self._on_body)
         self._states = bus.latest(STATE, on_new)
         self._scans = bus.latest(SCAN, on_new)
-        bus.subscribe(CMD_VEL, self._on_command)
-        bus.subscribe(JOINT_CMD, self._on_joint_command)
-        bus.subscribe(IMU, self._on_imu)
+        bus.subscribe(CMD_VEL, self._on_command, lazy=True)
+        bus.subscribe(JOINT_CMD, self._on_joint_command, lazy=True)
+        bus.subscribe(IMU, self._on_imu, lazy=True)
         for topic in COUNTED_TOPICS:
-            bus.subscribe(topic, lambda _key, _message: None)
-        self._worlds, self._intents = bus.latest(WORLD), bus.latest(INTENT)
+            bus.subscribe(topic, lambda _key, _message: None, lazy=True)
+        self._worlds = bus.latest(WORLD, lazy=True)
+        self._intents = bus.latest(INTENT, lazy=True)
 
     def inputs(self, body: BodyDescription) -> SafetyInputs | None:
         """Return the present inputs; None without a state.
@@ -325,7 +326,7 @@ class InputCollector:
         self._unsubscribe()
         self._command_key, self._unsubscribe = topic.key, _no_subscription
         if topic.key != CMD_VEL.key:
-            self._unsubscribe = self._bus.subscribe(topic, self._on_command)
+            self._unsubscribe = self._bus.subscribe(topic, self._on_command, lazy=True)
 
 
 def arm_shape(mjcf: str, body: BodyDescription) -> tuple[ArmShape | None, str]:

@@ -132,7 +132,7 @@ class FreezableTransport(LocalTransport):
         self.frozen = False
         self._missed: list[Callable[[], object]] = []
 
-    def subscribe(self, key: str, on_sample: OnSample, depth: int) -> Close:
+    def subscribe(self, key: str, on_sample: OnSample, depth: int, *, lazy: bool = False) -> Close:
         """Subscribe to `key`; samples wait while the process is frozen."""
 
         def receive(key: str, payload: bytes) -> None:
@@ -141,7 +141,7 @@ class FreezableTransport(LocalTransport):
             else:
                 on_sample(key, payload)
 
-        return super().subscribe(key, receive, depth)
+        return super().subscribe(key, receive, depth, lazy=lazy)
 
     def thaw(self) -> None:
         """Resume the process: deliver the missed samples, and later ones at once."""

@@ -40,7 +40,7 @@ class ShuffledEnd(LocalTransport):
         super().__init__(network)
         self.pending: list[Pending] = []  # in order of sending
 
-    def subscribe(self, key: str, on_sample: OnSample, depth: int) -> Close:
+    def subscribe(self, key: str, on_sample: OnSample, depth: int, *, lazy: bool = False) -> Close:
         def queue_message(key: str, payload: bytes) -> None:
             self.pending.append((key, payload, on_sample))
 

@@ -158,6 +158,19 @@ async def test_a_busy_loop_gets_the_newest_of_each_key_of_a_pattern(
     assert ear.samples[:2] == [(keys[0], b"198"), (keys[1], b"199")]
 
 
+async def test_a_lazy_message_is_received_before_the_next_one_that_wakes(
+    net: ZenohNetwork, arrived: list[bytes]
+) -> None:
+    sender, bus = Bus(await net.client(), Clock()), Bus(await net.client(), Clock())
+    received: list[str] = []
+    bus.subscribe(INTENT, lambda key, _: received.append(key), lazy=True)
+    bus.subscribe(TELEOP, lambda key, _: received.append(key))
+    await repeat(lambda: sender.publish(INTENT, example(Intent)), lambda: arrived)
+    assert received == []
+    await repeat(lambda: sender.publish(TELEOP, example(Twist)), lambda: received)
+    assert received[:2] == ["robot/intent", "robot/teleop"]
+
+
 async def test_a_closed_subscription_receives_nothing(net: ZenohNetwork) -> None:
     sender, receiver = await net.client(), await net.client()
     ear, other = (

@@ -68,14 +68,14 @@ class ZenohTransport:
             )
         publisher.put(payload)
 
-    def subscribe(self, key: str, on_sample: OnSample, depth: int) -> Close:
+    def subscribe(self, key: str, on_sample: OnSample, depth: int, *, lazy: bool = False) -> Close:
         """Subscribe; a busy loop keeps the newest `depth` samples of each key."""
         fixed = "" if "*" in key else key
 
         def deliver(sample: zenoh.Sample) -> bool | None:
             return on_sample(fixed or str(sample.key_expr), sample.payload.to_bytes())
 
-        mailbox = Mailbox(self._bridge, deliver, depth)
+        mailbox = Mailbox(self._bridge, deliver, depth, lazy=lazy)
 
         def put(sample: zenoh.Sample) -> None:
             mailbox.put(sample, str(sample.key_expr))

@@ -75,6 +75,7 @@ class HangingBus(Bus):
         on_bad: Callable[[bytes], None] | None = None,
         *,
         name: str = "*",
+        lazy: bool = False,
     ) -> Close:
         """Subscribe; messages of the hung topic are dropped while it hangs."""
 
@@ -82,7 +83,7 @@ class HangingBus(Bus):
             if topic is not self._hung or not self._hangs.is_set():
                 on_message(key, message)
 
-        return super().subscribe(topic, handle, on_bad, name=name)
+        return super().subscribe(topic, handle, on_bad, name=name, lazy=lazy)
 
 
 class Tampering(NamedTuple):

@@ -35,6 +35,19 @@ async def test_a_mailbox_of_one_hands_a_busy_loop_the_newest_only(receiver: Rece
     assert receiver.received == [99, 100]
 
 
+async def test_a_lazy_mailbox_waits_for_a_post_that_wakes_the_loop(receiver: Receiver) -> None:
+    lazy = Mailbox(receiver.bridge, receiver.received.append, 4, lazy=True)
+    for number in range(3):
+        lazy.put(number)
+    for _ in range(10):  # turns of the loop
+        await asyncio.sleep(0)
+    assert receiver.received == []
+    Mailbox(receiver.bridge, receiver.received.append, 1).put(100)
+    lazy.put(3)  # before the loop wakes: in the order of arrival, it belongs to the first ones
+    await receiver.until(5)
+    assert receiver.received == [0, 1, 2, 3, 100]
+
+
 async def test_what_cannot_be_read_does_not_push_out_what_can(receiver: Receiver) -> None:
     def read(number: int) -> bool:
         receiver.received.append(number)
