@@ -94,7 +94,7 @@ ALL: tuple[Role, ...] = ("brain", "operator", "viewer")
 SCAN = Topic(
     "robot/scan", sensors.LaserScan, 10, missed=2.5, max_bytes=64 * KB, drawing="scan",
 )  # fmt: skip
-IMU = Topic("robot/imu", sensors.Imu, 100)
+IMU = Topic("robot/imu", sensors.Imu, 100, depth=8)  # none is lost: it may show a shock
 STATE = Topic(
     "robot/state", body.RobotState, 50, missed=12.5, keep=True, max_bytes=32 * KB,
     drawing="odometry", plotted=True,

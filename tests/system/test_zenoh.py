@@ -11,10 +11,12 @@ from gigabrain_schemas.brain import CmdVel, Intent, OccupancyGrid, Twist
 from gigabrain_schemas.examples import example
 from gigabrain_schemas.requests import GateReply
 from gigabrain_schemas.safety import Health
+from gigabrain_schemas.sensors import Imu
 from gigabrain_schemas.topics import (
     CMD_VEL,
     HEALTH,
     IMAGE,
+    IMU,
     INTENT,
     MAP,
     PERCEIVED,
@@ -156,6 +158,25 @@ async def test_a_busy_loop_gets_the_newest_of_each_key_of_a_pattern(
     publish_200_without_leaving_the_loop(sender, PERCEIVED, keys, arrived)
     await until(lambda: ear.samples)
     assert ear.samples[:2] == [(keys[0], b"198"), (keys[1], b"199")]
+
+
+def wait_without_leaving_the_loop(arrived: list[bytes], count: int) -> None:
+    deadline = time.monotonic() + 60
+    while len(arrived) < count and time.monotonic() < deadline:
+        time.sleep(0.0005)
+
+
+async def test_a_busy_process_loses_no_imu_sample(net: ZenohNetwork, arrived: list[bytes]) -> None:
+    sender, bus = Bus(await net.client(), Clock()), Bus(await net.client(), Clock())
+    received: list[int] = []
+    bus.subscribe(IMU, lambda _, imu: received.append(imu.seq))
+    await repeat(lambda: sender.publish(IMU, example(Imu)), lambda: received)
+    first, taken = sender.sent[IMU.key] + 1, len(received)
+    for _ in range(4):  # two ticks
+        sender.publish(IMU, example(Imu))
+    wait_without_leaving_the_loop(arrived, first + 3)
+    await until(lambda: received[-1] == first + 3)
+    assert received[taken:] == [first, first + 1, first + 2, first + 3]
 
 
 async def test_a_lazy_message_is_received_before_the_next_one_that_wakes(
