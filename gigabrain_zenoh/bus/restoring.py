@@ -1,6 +1,6 @@
 """Messages that are published only when they change, and again if another sender replaces them."""
 
-from typing import Any
+from typing import Any, TypeVar
 
 from msgspec.structs import replace
 
@@ -8,6 +8,7 @@ from gigabrain_schemas.base import Message
 from gigabrain_schemas.topics import Topic
 from gigabrain_zenoh.bus.bus import Bus
 
+M = TypeVar("M", bound=Message)
 NO_HEADER = dict.fromkeys(Message.__struct_fields__, 0)
 
 
@@ -19,13 +20,13 @@ class RestoringPublisher:
         self._own: dict[str, tuple[Topic[Any], Message]] = {}  # by key
         self._replaced: set[str] = set()
 
-    def publish(self, topic: Topic[Any], message: Message, *, basis: int = 0) -> None:
-        """Publish a message; receivers keep the newest one of its topic."""
+    def publish(self, topic: Topic[M], message: M, *, basis: int = 0) -> M:
+        """Publish a message, and return it as published. Receivers keep the newest of its topic."""
         first = topic.key not in self._own
         self._own[topic.key] = topic, replace(message, **NO_HEADER)
         if first:
             self._bus.subscribe(topic, self._on_message)
-        self._bus.publish(topic, message, basis=basis)
+        return self._bus.publish(topic, message, basis=basis)
 
     def restore(self, *, basis: int = 0) -> None:
         """Publish again the messages that were replaced since the last call."""

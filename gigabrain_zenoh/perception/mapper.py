@@ -23,6 +23,7 @@ from gigabrain_schemas.topics import MAP, MAP_LIST, MAP_LOAD, MAP_SAVE, POSE
 from gigabrain_schemas.zones import MapListReply, MapListRequest, MapLoadRequest
 from gigabrain_zenoh.bus.bus import Bus, Latest
 from gigabrain_zenoh.bus.input_log import log_accepted
+from gigabrain_zenoh.bus.restoring import RestoringPublisher
 from gigabrain_zenoh.config.settings import PerceptionConfig
 from gigabrain_zenoh.errors import ConfigError, Refused
 from gigabrain_zenoh.geometry.scan import beams
@@ -102,6 +103,7 @@ class Mapper:
         self._blank = not config.map  # the map is still empty
         self._mapped = False  # this process has processed a scan, or restored a map
         self._published: OccupancyGrid | None = None
+        self._restoring = RestoringPublisher(bus)
         self._checked_tick = self._sent_tick = 0
         self._autosave = self._autosave_of(config)
         self._restored: OdometrySample | None = None  # at the last scan of a restored map
@@ -299,9 +301,11 @@ class Mapper:
     def _publish_map(self, tick: int) -> None:
         """Publish the map when it has changed, at most every MAP_TICKS.
 
-        An unchanged map is published again after MAP_AGAIN_TICKS, in case another publisher has
-        replaced it.
+        An unchanged map is published again after MAP_AGAIN_TICKS, in case a receiver missed it. A
+        map or zones that another sender has replaced are published again at once.
         """
+        self._restoring.restore(basis=tick)
+        self._zones.republish(tick)
         if self._published and tick < self._checked_tick + MAP_TICKS:
             return
         self._checked_tick = tick
@@ -312,7 +316,7 @@ class Mapper:
         if grid.cells:
             self._zones.publish(tick)
         if due and grid.cells:
-            self._bus.publish(MAP, grid, basis=tick)
+            self._restoring.publish(MAP, grid, basis=tick)
             self._published, self._sent_tick = grid, tick
 
     def _log_problems(self) -> None:

@@ -29,6 +29,7 @@ from gigabrain_schemas.objects import (
 from gigabrain_schemas.topics import DETECTIONS, OBJECT_MAP, OBJECTS_CHANGE
 from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.bus.input_log import log_accepted
+from gigabrain_zenoh.bus.restoring import RestoringPublisher
 from gigabrain_zenoh.codec import DECODE_ERRORS
 from gigabrain_zenoh.config.settings import MappingMode
 from gigabrain_zenoh.errors import ConfigError, Refused
@@ -107,6 +108,7 @@ class ObjectServer:
         self._boot = self._tick = 0
         self._seen_tick: int | None = None  # of the last detections
         self._published = ObjectMap()
+        self._restoring = RestoringPublisher(bus)
         self._sent_tick: int | None = None
         self._newest_ticks: dict[str, int] = {}  # tick of the newest picture, by camera
         self._copies: deque[Copy] = deque(maxlen=2)  # the older one is 2 to 4 s old
@@ -211,7 +213,8 @@ class ObjectServer:
         self.tags.follow(keyframes)
 
     def publish(self, tick: int) -> None:
-        """Publish and save the objects if they are due at this tick."""
+        """Publish and save the objects if they are due at this tick, or were replaced."""
+        self._restoring.restore(basis=tick)
         since = REPUBLISH_TICKS if self._sent_tick is None else tick - self._sent_tick
         if 0 <= since < CHANGED_TICKS:
             return
@@ -224,7 +227,7 @@ class ObjectServer:
         )
         if 0 <= since < REPUBLISH_TICKS and _nearly_equal(now, self._published):
             return
-        self._published = self._bus.publish(OBJECT_MAP, now, basis=tick)
+        self._published = self._restoring.publish(OBJECT_MAP, now, basis=tick)
         self._sent_tick = tick
         self._keep(tick)
 

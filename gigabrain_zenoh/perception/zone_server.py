@@ -20,6 +20,7 @@ from gigabrain_schemas.topics import ZONES, ZONES_CHANGE
 from gigabrain_schemas.zones import Place, Zone, Zones, ZonesReply, ZonesRequest
 from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.bus.input_log import log_accepted
+from gigabrain_zenoh.bus.restoring import RestoringPublisher
 from gigabrain_zenoh.codec import DECODE_ERRORS
 from gigabrain_zenoh.config.settings import MappingMode
 from gigabrain_zenoh.errors import ConfigError, Refused, unknown
@@ -75,6 +76,7 @@ class ZoneServer:
 
     def __init__(self, bus: Bus, state_dir: str, basis: Callable[[], int]) -> None:
         self._bus, self._basis = bus, basis
+        self._restoring = RestoringPublisher(bus)
         self._state_path = Path(state_dir) / STATE_FILE if state_dir else None
         self._items: tuple[Anchored, ...] = ()
         self._poses: Floats = np.empty((0, 3))  # of keyframes, as in the newest grid
@@ -147,10 +149,14 @@ class ZoneServer:
     def publish(self, tick: int) -> None:
         """Publish the zones if they are due at this tick."""
         if self._sent_tick is None or not 0 <= tick - self._sent_tick < REPUBLISH_TICKS:
-            self._current = self._bus.publish(ZONES, self._current, basis=tick)
+            self._current = self._restoring.publish(ZONES, self._current, basis=tick)
             self._sent_tick = tick
             if self.problem:  # try again: the disk may have room now
                 self._keep_state()
+
+    def republish(self, tick: int) -> None:
+        """Publish the zones again if another sender has replaced them."""
+        self._restoring.restore(basis=tick)
 
     async def finish_writing(self) -> None:
         """Wait until the state is written."""

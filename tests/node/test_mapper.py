@@ -7,9 +7,11 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 
+from gigabrain_schemas.base import Message
 from gigabrain_schemas.brain import OccupancyGrid, PoseInMap
+from gigabrain_schemas.examples import example
 from gigabrain_schemas.safety import Health
-from gigabrain_schemas.topics import HEALTH, MAP, POSE, SCAN, STATE, WORLD
+from gigabrain_schemas.topics import HEALTH, MAP, POSE, SCAN, STATE, WORLD, ZONES, Topic
 from gigabrain_zenoh.codec import Codec
 from gigabrain_zenoh.config import loading as config
 from gigabrain_zenoh.config.settings import PerceptionConfig
@@ -83,6 +85,23 @@ async def test_a_changed_map_is_published_once_a_second() -> None:
     cells = np.frombuffer(last.cells, np.int8).reshape(last.height, last.width)
     column, row = int((0.5 - last.origin_x) / 0.05), int((0.0 - last.origin_y) / 0.05)
     assert 0 <= cells[row, column] < 20  # free: the robot passed it
+
+
+@pytest.mark.parametrize("topic", [MAP, ZONES])
+async def test_a_foreign_map_or_zones_are_replaced_at_the_next_scan(topic: Topic[Message]) -> None:
+    async with Robot() as robot:
+        robot.publish_body()
+        robot.drive(3)
+        own = robot.sent(topic)
+        robot.send(topic, replace(example(topic.type), boot=robot.boot, tick=robot.tick))
+        robot.drive(1)
+        again = robot.sent(topic)
+        robot.drive(1)
+        assert robot.sent(topic) == []
+    assert len(own) == 1
+    assert [one.basis for one in again] == [20]
+    header = {"stamp_ns": 0, "seq": 0, "tick": 0, "basis": 0}
+    assert replace(again[0], **header) == replace(own[0], **header)
 
 
 async def test_bad_scans_are_skipped_and_reported_once(caplog: pytest.LogCaptureFixture) -> None:

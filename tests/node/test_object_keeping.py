@@ -179,6 +179,18 @@ async def test_objects_are_published_on_change_and_every_two_seconds() -> None:
         assert min(b - a for a, b in itertools.pairwise(ticks)) >= 30
 
 
+async def test_foreign_objects_are_replaced_at_the_next_scan() -> None:
+    async with CameraRobot() as robot:
+        robot.publish_body()
+        robot.publish_scans(20, can())
+        assert robot.sent(OBJECT_MAP)
+        robot.send(OBJECT_MAP, ObjectMap(boot=robot.boot, tick=robot.tick))
+        robot.publish_scans(1)
+        assert [[one.label for one in sent.objects] for sent in robot.sent(OBJECT_MAP)] == [["can"]]
+        robot.publish_scans(1)
+        assert robot.sent(OBJECT_MAP) == []
+
+
 async def test_a_can_no_longer_seen_is_forgotten_and_a_ball_out_of_view_is_kept() -> None:
     async with CameraRobot() as robot:
         robot.publish_body()
