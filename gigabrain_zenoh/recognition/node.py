@@ -52,6 +52,7 @@ class _CameraInput:
     received_ns: int = 0  # arrival of that picture
     depths: dict[int, DepthImage] = field(default_factory=dict)  # by basis
     fault: QuietFault = field(default_factory=lambda: QuietFault(log))  # broken pictures
+    depth_fault: QuietFault = field(default_factory=lambda: QuietFault(log))
 
     def keep(self, depth: DepthImage) -> None:
         """Keep the depth of an exposure."""
@@ -156,9 +157,19 @@ class Recognition:
                 self.failed.set_exception(error)
         else:
             source.fault.end(f"camera {name}: its pictures are whole again", now_ns)
+            self._judge_depth(source, self._observer.broken_depth, now_ns)
             self._publish(found, picture)
             self._warn_of_sizes(found)
         self._start()
+
+    def _judge_depth(self, source: _CameraInput, problem: str, now_ns: int) -> None:
+        """Count and log broken depth: things in its picture have no position."""
+        name = source.camera.name
+        if problem:
+            self._bus.counters["broken_depths"] += 1
+            source.depth_fault.begin(f"camera {name}: recognised without depth: {problem}", now_ns)
+        else:
+            source.depth_fault.end(f"camera {name}: its depth is whole again", now_ns)
 
     def _warn_of_sizes(self, found: Detections) -> None:
         """Log once each tag whose size in several pictures differs from the settings."""

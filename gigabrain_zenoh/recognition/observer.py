@@ -34,9 +34,10 @@ class Observer:
     def __init__(self, net: Net | None, tags: TagFinder) -> None:
         self._net, self._tags = net, tags
         self._models: dict[Camera, CameraModel] = {}
+        self.broken_depth = ""  # why the newest picture's depth was not used; empty: it was whole
 
     def observe(self, camera: Camera, image: Image, depth: DepthImage | None) -> Detections:
-        """Return the detections in a picture.
+        """Return the detections in a picture; with broken depth, as without depth.
 
         Raises ValueError for a broken picture, or one of another size or camera.
         """
@@ -44,13 +45,9 @@ class Observer:
         if image.frame_id != camera.name:
             raise ValueError(f"a picture of the camera {image.frame_id!r}")
         picture = decoded(image)
-        if picture.shape[:2] != (camera.height, camera.width):
-            height, width = picture.shape[:2]
-            raise ValueError(
-                f"a picture of {width} x {height} pixels; the body's file says "
-                f"{camera.width} x {camera.height}"
-            )
-        model, depths = self._model(camera), _depths_of(depth, camera)
+        height, width = picture.shape[:2]
+        _check_size("a picture", width, height, camera)
+        model, depths = self._model(camera), self._depths_of(depth, camera)
         mono = picture.ndim == 2
         grey = picture if mono else _converted(picture, cv2.COLOR_BGR2GRAY)
         to_rgb = cv2.COLOR_GRAY2RGB if mono else cv2.COLOR_BGR2RGB
@@ -82,6 +79,28 @@ class Observer:
             self._models[camera] = CameraModel(camera)
         return self._models[camera]
 
+    def _depths_of(self, depth: DepthImage | None, camera: Camera) -> NDArray[np.uint16] | None:
+        """Return the depths of pixels [mm], 0 if unknown; None without whole depth of this size."""
+        self.broken_depth = ""
+        if depth is None:
+            return None
+        try:
+            _check_size("depth", depth.width, depth.height, camera)
+            pixels = depth.array()
+        except ValueError as error:
+            self.broken_depth = str(error)
+            return None
+        usable = (pixels >= camera.depth_min * 1e3) & (pixels <= camera.depth_max * 1e3)
+        return np.where(usable, pixels, np.uint16(0))
+
+
+def _check_size(what: str, width: int, height: int, camera: Camera) -> None:
+    if (width, height) != (camera.width, camera.height):
+        raise ValueError(
+            f"{what} of {width} x {height} pixels; the body's file says "
+            f"{camera.width} x {camera.height}"
+        )
+
 
 def _find(net: Net, picture: NDArray[np.uint8], model: CameraModel) -> Found:
     """Turn a picture upright for the net in steps of 90°; return boxes in the original's pixels."""
@@ -97,18 +116,6 @@ def _find(net: Net, picture: NDArray[np.uint8], model: CameraModel) -> Found:
 
 def _converted(picture: NDArray[np.uint8], conversion: int) -> NDArray[np.uint8]:
     return np.asarray(cv2.cvtColor(picture, conversion), np.uint8)
-
-
-def _depths_of(depth: DepthImage | None, camera: Camera) -> NDArray[np.uint16] | None:
-    """Return the depths of pixels [mm], 0 if unknown; None without a picture of this size.
-
-    Raises ValueError for a broken depth picture.
-    """
-    if depth is None or (depth.height, depth.width) != (camera.height, camera.width):
-        return None
-    pixels = depth.array()
-    usable = (pixels >= camera.depth_min * 1e3) & (pixels <= camera.depth_max * 1e3)
-    return np.where(usable, pixels, np.uint16(0))
 
 
 def _tag_box(tag: TagDetection) -> Box:

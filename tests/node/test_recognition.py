@@ -244,7 +244,7 @@ async def test_a_picture_waits_for_its_depth_for_100_ms():
         assert found.things[0].position is None
 
 
-async def test_depth_of_another_exposure_or_broken_depth_is_not_used():
+async def test_depth_of_another_exposure_is_not_used():
     async with running() as robot:
         robot.publish_picture(38)
         await robot.wait_for_detections(1)
@@ -255,12 +255,6 @@ async def test_depth_of_another_exposure_or_broken_depth_is_not_used():
         found = await robot.wait_for_detections(2)
         assert found.basis == 39
         assert found.things[0].position is None
-        await robot.advance_s(1)
-        about: dict[str, Any] = {"frame_id": "front", "width": 320, "height": 240}
-        broken = DepthImage(**about, planes=(b"no", b"zlib", b"at", b"all"))
-        robot.bus.publish(DEPTH, broken, basis=40, name="front")
-        robot.publish_picture(40, depth=False)
-        await until(lambda: robot.recognition_bus.counters["broken_pictures"] == 1, "a refusal")
 
 
 async def test_a_hanging_net_is_no_progress_but_an_idle_one_is():

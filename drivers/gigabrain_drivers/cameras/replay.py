@@ -1,21 +1,31 @@
 """A camera that plays back a recording (`gigabrain record`) at the recorded pace."""
 
+import logging
 import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from gigabrain_drivers.cameras.base import CameraLost, CameraOptions, CameraSource, Frame
+from gigabrain_drivers.cameras.base import (
+    CameraLost,
+    CameraOptions,
+    CameraSite,
+    CameraSource,
+    Frame,
+)
 from gigabrain_drivers.cameras.opencv import fitted
+from gigabrain_schemas.body import Camera
 from gigabrain_schemas.sensors import Image
 from gigabrain_schemas.topics import DEPTH, IMAGE
 from gigabrain_schemas.vision import DepthImage
 from gigabrain_zenoh.codec import Codec
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.host.files import expanded
+from gigabrain_zenoh.logs import QuietFault
 from gigabrain_zenoh.recording.bag_reader import samples
 from gigabrain_zenoh.vision.pictures import decoded
 
+log = logging.getLogger(__name__)
 MAX_WAIT_S = 1.0  # between two pictures; longer gaps in a recording are shortened
 
 
@@ -35,7 +45,7 @@ class Recorded(NamedTuple):
 
 
 class ReplayedCamera(CameraSource):
-    """Pictures and depth from a recording. Needs the extra `record`."""
+    """Pictures and depth from a recording; broken depth is left out. Needs the extra `record`."""
 
     Options = ReplayOptions
     options: ReplayOptions
@@ -43,6 +53,10 @@ class ReplayedCamera(CameraSource):
     _exposures: Iterator[Recorded] | None = None
     _ended = False
     _last: tuple[int, float] | None = None  # newest exposure: stamp [ns], time of return [s]
+
+    def __init__(self, options: Any, camera: Camera, site: CameraSite) -> None:
+        super().__init__(options, camera, site)
+        self._depth_fault = QuietFault(log)
 
     def open(self) -> None:
         """Open the recording at its start. Raises CameraLost after the end, without `repeat`.
@@ -94,12 +108,25 @@ class ReplayedCamera(CameraSource):
         self._last = stamp_ns, now_s
 
     def _frame(self, one: Recorded) -> Frame:
-        """Decode an exposure. Raises ValueError if it is broken, CameraLost for another size."""
+        """Decode an exposure; a picture with broken depth comes without it.
+
+        Raises ValueError if nothing is whole, and CameraLost for another size.
+        """
         camera = self.camera
         picture = None if one.picture is None else decoded(one.picture)
-        depth = one.depth.array() if one.depth and camera.depth else None
         if picture is not None:
             picture = fitted(picture, camera.width, camera.height)
+        if one.depth is None or not camera.depth:
+            return Frame(picture)
+        about, now_ns = f"camera {camera.name}: depth in {self.options.file}", time.monotonic_ns()
+        try:
+            depth = one.depth.array()
+        except ValueError as error:
+            if picture is None:
+                raise
+            self._depth_fault.begin(f"{about} is broken and left out: {error}", now_ns)
+            return Frame(picture)
+        self._depth_fault.end(f"{about} is whole again", now_ns)
         return Frame(picture, depth)
 
 

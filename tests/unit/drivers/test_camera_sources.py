@@ -279,7 +279,13 @@ def jpeg(grey: int) -> bytes:
     return bytes(cv2.imencode(".jpg", picture)[1].tobytes())
 
 
-def recording(path: Path, *, broken: Container[int] = (), exposures: int = 3) -> None:
+def recording(
+    path: Path,
+    *,
+    broken: Container[int] = (),
+    broken_depth: Container[int] = (),
+    exposures: int = 3,
+) -> None:
     """Up to three exposures at 10 Hz of the camera `front`, and as many of another."""
     file = BagWriter(path, viewers=False, notes={})
     with closing(file):
@@ -287,11 +293,13 @@ def recording(path: Path, *, broken: Container[int] = (), exposures: int = 3) ->
             header = {"basis": 5 * number + 5, "stamp_ns": 10**18 + number * 10**8}
             about = {"frame_id": "front", "height": 48, "width": 64}
             data = b"no jpeg" if number in broken else jpeg(grey)
-            depth = np.full((48, 64), grey, np.uint16)
+            planes = pack_depth(np.full((48, 64), grey, np.uint16))
+            if number in broken_depth:
+                planes = (planes[0][:-4], *planes[1:])
             messages: list[tuple[Topic, str, object]] = [
                 (IMAGE, "front", Image(**about, **header, encoding="jpeg", data=data)),
                 (IMAGE, "rear", Image(**about, **header, encoding="jpeg", data=jpeg(0))),
-                (DEPTH, "front", DepthImage(**about, **header, planes=pack_depth(depth))),
+                (DEPTH, "front", DepthImage(**about, **header, planes=planes)),
             ]
             for topic, name, message in messages:
                 payload = codec.encode(message)  # type: ignore[type-var]
@@ -345,6 +353,20 @@ def test_a_broken_picture_of_a_recording_is_skipped(
     assert means(source, 4) == [*whole, *whole]
     assert slept[0] == pytest.approx(0.1 if broken == 0 else 0.2, abs=0.05)
     source.close()
+
+
+def test_a_picture_with_broken_depth_comes_without_it(
+    tmp_path: Path, slept: list[float], caplog: pytest.LogCaptureFixture
+) -> None:
+    recording(tmp_path / "drive.mcap", broken_depth=[0, 1])
+    source = replayed(tmp_path)
+    source.open()
+    frames = [source.read() for _ in GREYS]
+    assert [one.depth is None for one in frames] == [True, True, False]
+    greys = [float(one.picture.mean()) for one in frames if one.picture is not None]
+    assert greys == pytest.approx([*GREYS], abs=3)
+    (begun,) = caplog.messages
+    assert begun.startswith("camera front: depth in drive.mcap is broken and left out: a plane of ")
 
 
 def test_a_thinned_recording_gives_whole_exposures_at_their_rate(
