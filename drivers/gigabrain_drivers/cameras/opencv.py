@@ -4,13 +4,16 @@ import math
 import os
 import re
 import socket
+import stat
+import sys
 import time
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 from urllib.parse import urlsplit
 
 import cv2
 import numpy as np
+from msgspec import Meta
 from numpy.typing import NDArray
 
 from gigabrain_drivers.cameras.base import CameraLost, CameraOptions, CameraSource, Frame, Picture
@@ -20,6 +23,9 @@ TIMEOUT_MS = 3000  # for opening a stream, and for reading from it
 ASPECT_TOLERANCE = 0.01  # relative difference of the aspect ratios of two pictures
 MAX_PIXELS = 16_000_000  # of a picture before scaling
 MAX_BROKEN = 1000  # after this many broken pictures in a row, a film has ended
+MAX_LIVE_BROKEN = 3  # after this many in a row, a device or a stream is lost
+SLOW_READ_S = 1.0  # a failed read of a device or a stream that takes longer has timed out
+BUSY = "; check that nothing else uses it, and that this user is in the group 'video'"
 # port of a stream, and a request that a server answers whatever it streams; one that expects TLS
 # answers it with an error
 QUESTIONS = {
@@ -33,7 +39,8 @@ QUESTIONS = {
 class OpenCvOptions(CameraOptions, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Fields of a camera that OpenCV opens."""
 
-    device: str  # /dev/video0, 0, rtsp://..., http://..., or a file beside the robot's file
+    device: Annotated[str, Meta(min_length=1)]
+    # /dev/video0, /dev/v4l/by-id/..., 0, rtsp://..., http://..., or a file beside the robot's file
 
 
 class OpenCvCamera(CameraSource):
@@ -56,14 +63,15 @@ class OpenCvCamera(CameraSource):
         target, backend = self._target()
         timeouts = [cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, TIMEOUT_MS]
         timeouts += [cv2.CAP_PROP_READ_TIMEOUT_MSEC, TIMEOUT_MS]
-        network = isinstance(target, str) and "://" in target
+        network = backend == cv2.CAP_FFMPEG
+        device = not self._file and not network
         if network and (problem := _unanswered(self.options.device)):
             raise CameraLost(f"{self._shown} {problem}")
         capture = cv2.VideoCapture(target, backend, timeouts if network else [])
         self._capture, self._due_s, self._reads = capture, time.monotonic(), 0
         if not capture.isOpened():
-            raise CameraLost(f"{self._shown} cannot be opened")
-        if not self._file and not network:
+            raise CameraLost(f"{self._shown} cannot be opened{BUSY if device else ''}")
+        if device:
             capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)  # prefer no picture to an old one
             capture.set(cv2.CAP_PROP_FRAME_WIDTH, self.camera.width)
             capture.set(cv2.CAP_PROP_FRAME_HEIGHT, self.camera.height)
@@ -110,30 +118,38 @@ class OpenCvCamera(CameraSource):
         return f"{start}…" if "@" in rest else start + host
 
     def _next(self, capture: cv2.VideoCapture) -> NDArray[Any] | None:
-        """Return the next picture, or None; a file's broken pictures are skipped."""
+        """Return the next picture, or None; broken pictures are skipped."""
         count = capture.get(cv2.CAP_PROP_FRAME_COUNT) if self._file else 0
-        for _ in range(MAX_BROKEN):
+        for _ in range(MAX_BROKEN if self._file else MAX_LIVE_BROKEN):
+            began_s = time.monotonic()
             ok, picture = capture.read()
             self._reads += 1
             if ok:
                 return np.asarray(picture)
-            if self._reads >= count:
+            took_s = time.monotonic() - began_s
+            if self._reads >= count if self._file else took_s > SLOW_READ_S:
                 break
         return None
 
     def _target(self) -> tuple[int | str, int]:
-        device = self.options.device
-        if device.isdecimal():
-            return int(device), cv2.CAP_ANY
+        """Return what OpenCV opens, and by which backend. Raises CameraLost."""
+        device, linux = self.options.device, sys.platform == "linux"
         if "://" in device:
-            return device, cv2.CAP_ANY
-        path = Path(self.site.folder) / expanded(device)
-        self._file = path.is_file()
-        if not path.exists():
-            raise CameraLost(f"{device} is not there")
-        if not self._file and not path.is_char_device():  # opening a pipe would block all others
-            raise CameraLost(f"{device} is no camera and no file")
-        return str(path), cv2.CAP_ANY
+            return device, cv2.CAP_FFMPEG  # others have no timeouts, and print the address
+        if device.isdecimal() and not linux:
+            return int(device), cv2.CAP_ANY
+        path = Path(f"/dev/video{int(device)}") if device.isdecimal() else expanded(device)
+        path = self.site.folder / path
+        try:
+            mode = path.stat().st_mode
+        except (FileNotFoundError, ValueError):  # ValueError: a null character
+            raise CameraLost(f"{self._shown} is not there") from None
+        except OSError as error:
+            raise CameraLost(f"{self._shown} cannot be opened: {error.strerror}") from None
+        self._file = stat.S_ISREG(mode)
+        if not self._file and not stat.S_ISCHR(mode):  # opening a pipe would block all others
+            raise CameraLost(f"{self._shown} is no camera and no file")
+        return str(path), cv2.CAP_V4L2 if linux and not self._file else cv2.CAP_ANY
 
 
 def _unanswered(address: str) -> str:
@@ -171,9 +187,13 @@ def _unanswered(address: str) -> str:
 def fitted(picture: NDArray[Any], width: int, height: int) -> Picture:
     """Return a picture in the size of the body's file, in colour. Raises CameraLost."""
     tall, wide = picture.shape[:2]
-    if picture.dtype != np.uint8 or tall * wide > MAX_PIXELS:
-        raise CameraLost(f"gives pictures of {wide} x {tall} pixels of {picture.dtype}")
-    if picture.ndim == 2:
+    channels = picture.shape[2] if picture.ndim == 3 else 1
+    if picture.dtype != np.uint8 or channels not in (1, 3) or not 0 < tall * wide <= MAX_PIXELS:
+        kind = f"{channels} channels of {picture.dtype}"
+        raise CameraLost(
+            f"gives pictures of {wide} x {tall} pixels, {kind}; expected 1 or 3 of uint8"
+        )
+    if channels == 1:
         picture = np.asarray(cv2.cvtColor(picture, cv2.COLOR_GRAY2BGR), np.uint8)
     if (wide, tall) == (width, height):
         return np.asarray(picture, np.uint8)

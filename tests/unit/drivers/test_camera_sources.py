@@ -1,14 +1,17 @@
 """Pictures of files, and of recordings, come as those of a camera do."""
 
 import contextlib
+import itertools
 import os
 import socket
+import sys
 import threading
 import time
 from collections.abc import Callable, Container
 from contextlib import closing
 from http.server import BaseHTTPRequestHandler, HTTPServer
 from pathlib import Path
+from typing import ClassVar
 
 import cv2
 import numpy as np
@@ -179,6 +182,12 @@ def test_a_larger_picture_of_the_same_shape_is_scaled_and_another_refused(
     ("device", "error"),
     [
         ("/dev/video97", "/dev/video97 is not there"),
+        ("/dev/v4l/by-id/usb-none", "/dev/v4l/by-id/usb-none is not there"),
+        ("99", "99 (is not there|cannot be opened)"),
+        (str(2**31), f"{2**31} (is not there|cannot be opened)"),
+        ("x" * 300, "x cannot be opened: File name too long"),
+        ("null\0", "null\0 is not there"),
+        ("film.avi/0", "film.avi/0 cannot be opened: Not a directory"),
         ("no.mp4", "no.mp4 is not there"),
         ("garbage.avi", "garbage.avi cannot be opened"),
         ("http://127.0.0.1:9/x.mjpg", "cannot be opened"),
@@ -186,6 +195,7 @@ def test_a_larger_picture_of_the_same_shape_is_scaled_and_another_refused(
 )
 def test_what_cannot_be_opened_is_named(tmp_path: Path, device: str, error: str) -> None:
     (tmp_path / "garbage.avi").write_bytes(bytes(range(256)) * 20)
+    film(tmp_path / "film.avi")
     source = camera(tmp_path, device)
     with pytest.raises(CameraLost, match=error):
         source.open()
@@ -267,11 +277,110 @@ def test_a_stream_that_answers_nothing_is_named(
             silent.open()
 
 
-def test_grey_pictures_get_three_channels_and_enormous_ones_are_refused() -> None:
-    assert fitted(np.full((48, 64), 9, np.uint8), 64, 48).shape == (48, 64, 3)
-    for wrong in (np.zeros((5000, 5000, 3), np.uint8), np.zeros((48, 64), np.uint16)):
-        with pytest.raises(CameraLost, match="gives pictures of"):
-            fitted(wrong, 64, 48)
+@pytest.mark.parametrize("shape", [(48, 64), (48, 64, 1)])
+def test_grey_pictures_get_three_channels(shape: tuple[int, ...]) -> None:
+    assert fitted(np.full(shape, 9, np.uint8), 64, 48).shape == (48, 64, 3)
+
+
+@pytest.mark.parametrize(
+    ("shape", "kind"),
+    [
+        ((5000, 5000, 3), "uint8"),
+        ((48, 64), "uint16"),
+        ((0, 0, 3), "uint8"),
+        ((48, 0), "uint8"),
+        ((48, 64, 2), "uint8"),
+        ((48, 64, 4), "uint8"),
+    ],
+)
+def test_pictures_of_an_impossible_kind_are_refused(shape: tuple[int, ...], kind: str) -> None:
+    with pytest.raises(CameraLost, match=f"gives pictures of .* of {kind}; expected 1 or 3"):
+        fitted(np.zeros(shape, kind), 64, 48)
+
+
+class FakeCapture:
+    """A cv2.VideoCapture that keeps its arguments, and gives the scripted reads."""
+
+    reads: ClassVar[list[bool]] = []
+    opens: ClassVar[list[tuple[object, int]]] = []
+    works = True
+
+    def __init__(self, target: object, backend: int, _: object) -> None:
+        self.opens.append((target, backend))
+
+    def isOpened(self) -> bool:
+        return self.works
+
+    def set(self, *_: object) -> bool:
+        return False
+
+    def get(self, _: int) -> float:
+        return 0.0
+
+    def read(self) -> tuple[bool, np.ndarray | None]:
+        ok = self.reads.pop(0)
+        return ok, np.full((48, 64, 3), 40, np.uint8) if ok else None
+
+    def release(self) -> None: ...
+
+
+@pytest.fixture
+def fake(monkeypatch: pytest.MonkeyPatch) -> type[FakeCapture]:
+    fresh = type("FreshCapture", (FakeCapture,), {"reads": [], "opens": []})
+    monkeypatch.setattr(cv2, "VideoCapture", fresh)
+    return fresh
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="V4L2 is a part of Linux")
+@pytest.mark.parametrize("device", ["/dev/null", "by-id/usb-camera", "stream", "film.avi"])
+def test_a_device_is_opened_by_v4l2_and_a_stream_by_ffmpeg(
+    tmp_path: Path, fake: type[FakeCapture], monkeypatch: pytest.MonkeyPatch, device: str
+) -> None:
+    film(tmp_path / "film.avi")
+    (tmp_path / "by-id").mkdir()
+    (tmp_path / "by-id" / "usb-camera").symlink_to("/dev/null")
+    monkeypatch.setattr(opencv, "_unanswered", lambda _: "")
+    device = "rtsp://127.0.0.1:9/live" if device == "stream" else device
+    camera(tmp_path, device).open()
+    expected = {
+        "/dev/null": ("/dev/null", cv2.CAP_V4L2),
+        "by-id/usb-camera": (str(tmp_path / "by-id" / "usb-camera"), cv2.CAP_V4L2),
+        "rtsp://127.0.0.1:9/live": ("rtsp://127.0.0.1:9/live", cv2.CAP_FFMPEG),
+        "film.avi": (str(tmp_path / "film.avi"), cv2.CAP_ANY),
+    }
+    assert fake.opens == [expected[device]]
+
+
+def test_a_device_that_another_camera_uses_is_named(
+    tmp_path: Path, fake: type[FakeCapture]
+) -> None:
+    fake.works = False
+    with pytest.raises(CameraLost, match="/dev/null cannot be opened; check that nothing else"):
+        camera(tmp_path, "/dev/null").open()
+
+
+def test_single_broken_pictures_of_a_device_are_skipped(
+    tmp_path: Path, fake: type[FakeCapture]
+) -> None:
+    fake.reads += [True, False, True, False, False, True, False, False, False]
+    source = camera(tmp_path, "/dev/null")
+    source.open()
+    assert means(source, 3) == [40] * 3
+    with pytest.raises(CameraLost, match="/dev/null gives no picture"):
+        source.read()
+    assert fake.reads == []
+
+
+def test_a_read_that_times_out_is_not_repeated(
+    tmp_path: Path, fake: type[FakeCapture], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fake.reads += [False, True]
+    monkeypatch.setattr(time, "monotonic", itertools.count(0.0, 3.0).__next__)
+    source = camera(tmp_path, "/dev/null")
+    source.open()
+    with pytest.raises(CameraLost, match="gives no picture"):
+        source.read()
+    assert fake.reads == [True]
 
 
 def jpeg(grey: int) -> bytes:
