@@ -17,7 +17,15 @@ GigabrainError
 """
 
 import difflib
+import re
 from collections.abc import Iterable
+
+LOGIN = re.compile(r"(?<=://)[^\s\"']*@")  # of an address in a text; a password may hold any of :/@
+
+
+def without_logins(text: str) -> str:
+    """Return a text without the user and the password of each address in it."""
+    return LOGIN.sub("…@", text) if "://" in text else text
 
 
 class GigabrainError(Exception):
@@ -27,13 +35,16 @@ class GigabrainError(Exception):
 
 
 class ConfigError(GigabrainError):
-    """An invalid configuration; the text names the file, the line and the expected value."""
+    """An invalid configuration; the text names the file, the line and the expected value.
+
+    Files may hold addresses with passwords, so these are left out of the text.
+    """
 
     exit_code = 2
 
     def __init__(self, text: str, *, value: str | None = None) -> None:
         """Create an error; `value` is the invalid value, used to find its line in a file."""
-        super().__init__(text)
+        super().__init__(without_logins(text))
         self.value = value
 
 

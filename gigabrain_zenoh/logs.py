@@ -17,7 +17,7 @@ import msgspec
 
 from gigabrain_schemas.safety import LogRecord
 from gigabrain_zenoh import errors
-from gigabrain_zenoh.errors import GigabrainError
+from gigabrain_zenoh.errors import GigabrainError, without_logins
 from gigabrain_zenoh.host.escaping import printable
 from gigabrain_zenoh.host.run_folders import unwritable_runs
 
@@ -50,7 +50,7 @@ def fields(record: logging.LogRecord, process: str) -> dict[str, Any]:
     """Return `{"t": unix_ns, "level", "process", "event", "text"}` and the record's own `data`.
 
     `data` is passed as `extra={"data": {...}}`. Its key `event` names the event; other keys cannot
-    replace the fields above.
+    replace the fields above. Addresses in texts have no user and password.
     """
     data = getattr(record, "data", {})
     known: dict[str, Any] = {
@@ -62,7 +62,8 @@ def fields(record: logging.LogRecord, process: str) -> dict[str, Any]:
     }
     if record.exc_info:
         known["traceback"] = _FORMATTER.formatException(record.exc_info)
-    return known | {str(k): v for k, v in data.items() if k not in known}
+    whole = known | {str(k): v for k, v in data.items() if k not in known}
+    return {k: without_logins(v) if isinstance(v, str) else v for k, v in whole.items()}
 
 
 def _text_of(record: logging.LogRecord) -> str:

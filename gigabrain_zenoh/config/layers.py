@@ -12,6 +12,7 @@ from gigabrain_zenoh.config import loading
 from gigabrain_zenoh.config.type_members import is_mapping, is_struct, members_of
 from gigabrain_zenoh.config.yaml_text import Entry, Node
 from gigabrain_zenoh.errors import ConfigError, UnknownName
+from gigabrain_zenoh.host.network import host_shown
 
 T = TypeVar("T")
 DEFAULT = "default"
@@ -21,7 +22,7 @@ class Row(NamedTuple):
     """One setting, with its value and the source of the value."""
 
     key: str  # dotted
-    value: Any
+    value: Any  # of an address only its host
     source: str
 
 
@@ -53,7 +54,7 @@ class Layers:
         """Yield every value of `settings`, the converted section `at`, with its source."""
         prefix = "".join(f"{name}." for name in at)
         for path, value in _leaves(msgspec.json.decode(msgspec.json.encode(settings))):
-            yield Row(prefix + ".".join(path), value, self.source_of((*at, *path)))
+            yield Row(prefix + ".".join(path), _shown(value), self.source_of((*at, *path)))
 
     def place(self, number: int) -> str:
         """Return the text of the place that a node of the merged tree has as its `line`."""
@@ -129,6 +130,15 @@ def _leaves(value: Any, path: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str,
         yield path, value
 
 
+def _shown(value: Any) -> Any:
+    """Return plain values with only the hosts of addresses."""
+    if isinstance(value, str):
+        return host_shown(value)
+    if isinstance(value, Mapping):
+        return {key: _shown(inner) for key, inner in value.items()}
+    return [_shown(inner) for inner in value] if isinstance(value, list) else value
+
+
 class Assignment(NamedTuple):
     """A setting from KEY=VALUE."""
 
@@ -147,8 +157,8 @@ def assignment(text: str) -> Assignment:
     """Parse KEY=VALUE, with a YAML value. Raises ConfigError."""
     key, equals, value = text.partition("=")
     if not equals or not key.strip():
-        raise ConfigError(f"--set: expected KEY=VALUE, got {text!r}")
-    root = loading.document(f"value: {value}", f"--set {text}")
+        raise ConfigError(f"--set: expected KEY=VALUE, got {host_shown(text)!r}")
+    root = loading.document(f"value: {value}", f"--set {host_shown(text)}")
     return Assignment(key.strip(), loading.part(root, ("value",)))
 
 

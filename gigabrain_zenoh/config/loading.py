@@ -29,6 +29,7 @@ from gigabrain_zenoh.config.type_members import (
 from gigabrain_zenoh.config.yaml_text import Entry, Node
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.host.files import expanded, read_bounded
+from gigabrain_zenoh.host.network import host_shown
 
 _MAX_SHOWN_CHARS = 60  # of a value in an error
 _NAMES: tuple[tuple[tuple[type, ...], str], ...] = (
@@ -106,8 +107,8 @@ def got(node: Node) -> str:
         return f"a list of {len(node.items)}"
     if node.value is None:
         return node.text or "nothing"
-    longest = _MAX_SHOWN_CHARS
-    text = node.text if len(node.text) <= longest else node.text[: longest - 3] + "..."
+    longest, text = _MAX_SHOWN_CHARS, host_shown(node.text)
+    text = text if len(text) <= longest else text[: longest - 3] + "..."
     if isinstance(node.value, bool) and text in ("on", "off"):
         return f"{text}, which is read as {str(node.value).lower()}; quote it for a text"
     return repr(text) if isinstance(node.value, str) else text

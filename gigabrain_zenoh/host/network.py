@@ -1,4 +1,4 @@
-"""Zenoh endpoints, the hosts that they name, and free ports."""
+"""Zenoh endpoints, the hosts that addresses name, and free ports."""
 
 import ipaddress
 import re
@@ -12,6 +12,20 @@ IP_ENDPOINT = re.compile(
 LOCAL_ENDPOINT = re.compile(r"unixsock-stream/.+")
 LABEL = re.compile(r"[a-z0-9_](?:[a-z0-9_-]{0,61}[a-z0-9_])?", re.IGNORECASE | re.ASCII)
 MAX_NAME_CHARS = 253  # RFC 1035, 2.3.4
+
+ADDRESS = re.compile(r"(.*?://)(?:[^/?#]*@)?([^/?#]*)(.*)", re.DOTALL)
+
+
+def host_shown(text: str) -> str:
+    """Return a text that may hold an address, such as rtsp://HOST/PATH, only up to its host.
+
+    The rest may hold a password. Where the host cannot be found with certainty, it is left out too.
+    """
+    address = ADDRESS.fullmatch(text)
+    if address is None:
+        return text
+    start, host, rest = address.groups()
+    return f"{start}…" if "@" in rest else start + host
 
 
 def host_and_port(endpoint: str) -> tuple[str, int]:

@@ -132,8 +132,8 @@ def state_locked(folder: Path, label: str, host: str) -> Iterator[None]:
 def new_run_dir(base: Path | None, label: str) -> Path:
     """Create `<base>/<UTC stamp>-<label>-<pid>`; `base` None is the user's state folder (XDG).
 
-    Old run folders are removed first (see `prune`), and this one is marked as in use. Raises
-    ConfigError when it cannot be created, and DiskFull.
+    Only this user can read it. Old run folders are removed first (see `prune`), and this one is
+    marked as in use. Raises ConfigError when it cannot be created, and DiskFull.
     """
     base = base or state_dir() / "runs"
     stamp = time.strftime("%Y%m%dT%H%M%SZ", time.gmtime())
@@ -145,7 +145,7 @@ def new_run_dir(base: Path | None, label: str) -> Path:
                 if not path.exists():  # an earlier run of this process in this second has it
                     break
             number = max(map(_number, past_runs(base)), default=0) + 1
-            path.mkdir()
+            path.mkdir(mode=0o700)
             hold(path, number)
             return path
     except OSError as error:

@@ -16,6 +16,7 @@ from gigabrain_zenoh.config.settings import DecisionConfig, LinkName
 from gigabrain_zenoh.decision import behaviours
 from gigabrain_zenoh.errors import ConfigError, UnknownName
 from gigabrain_zenoh.host.files import read_bounded, replace_file
+from gigabrain_zenoh.host.network import host_shown
 from gigabrain_zenoh.launch.deployment import (
     Deployment,
     deployment_type,
@@ -76,7 +77,8 @@ def merge(
         first = given.key in SET_FIRST
         key = given.key if first else full_key(given.key, _keys(layers, robot_type), SETTINGS)
         value = with_files(given._replace(key=key).nested(), Path())
-        layers.add(value, lambda _, text=text: f"--set {text}")  # type: ignore[misc]
+        place = f"--set {host_shown(text)}"
+        layers.add(value, lambda _, place=place: place)  # type: ignore[misc]
     deployment = layers.convert(_type_of(layers))
     return MergedDeployment(layers, structs.replace(deployment, keys=keys or deployment.keys))
 
@@ -88,7 +90,7 @@ def write_rows(run_dir: Path, rows: Sequence[Row]) -> None:
     """
     try:
         if rows:
-            replace_file(run_dir / ROWS_FILE, msgspec.json.encode(rows))
+            replace_file(run_dir / ROWS_FILE, msgspec.json.encode(rows), 0o600)
     except OSError as error:
         log.warning("cannot write %s: %s", run_dir / ROWS_FILE, error.strerror)
 

@@ -11,6 +11,7 @@ from typing import Any, cast
 
 import msgspec
 
+from gigabrain_zenoh.errors import without_logins
 from gigabrain_zenoh.host import this_process
 from gigabrain_zenoh.host.terminal import LineSplitter
 from gigabrain_zenoh.logs import is_time, level_named
@@ -29,7 +30,8 @@ def supervised_environment() -> dict[str, str]:
 def as_record(line: bytes, process: str) -> dict[str, Any]:
     """Return the log record in a line of output; other lines become the text of a record.
 
-    Libraries name levels differently, and `gigabrain log` shows only ours.
+    Libraries name levels differently, and `gigabrain log` shows only ours. They may also print an
+    address with its password.
     """
     known = {"t": time.time_ns(), "level": "info", "process": process, "event": "output"}
     with contextlib.suppress(msgspec.DecodeError, UnicodeDecodeError, RecursionError):
@@ -39,7 +41,8 @@ def as_record(line: bytes, process: str) -> dict[str, Any]:
             record = known | valid
             t = record["t"] if is_time(record["t"]) else known["t"]
             return record | {"t": t, "level": level_named(record["level"])}
-    return known | {"level": "error", "text": line.decode(errors="replace").rstrip()}
+    text = without_logins(line.decode(errors="replace").rstrip())
+    return known | {"level": "error", "text": text}
 
 
 class Child(asyncio.SubprocessProtocol):

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from gigabrain_drivers.cameras.base import CameraLost, CameraOptions, CameraSource, Frame, Picture
 from gigabrain_zenoh.host.files import expanded
+from gigabrain_zenoh.host.network import host_shown
 
 TIMEOUT_MS = 3000  # for opening a stream, and for reading from it
 ASPECT_TOLERANCE = 0.01  # relative difference of the aspect ratios of two pictures
@@ -105,17 +106,8 @@ class OpenCvCamera(CameraSource):
 
     @property
     def _shown(self) -> str:
-        """Return the device for messages; without the user and password of an address.
-
-        Where the host cannot be found with certainty, it is left out too.
-        """
-        address = re.fullmatch(
-            r"(.*?://)(?:[^/?#]*@)?([^/?#]*)(.*)", self.options.device, re.DOTALL
-        )
-        if address is None:
-            return self.options.device
-        start, host, rest = address.groups()
-        return f"{start}…" if "@" in rest else start + host
+        """Return the device for messages, without the user and password of an address."""
+        return re.sub(r"^.*:.*@", "…@", host_shown(self.options.device))  # also without ://
 
     def _next(self, capture: cv2.VideoCapture) -> NDArray[Any] | None:
         """Return the next picture, or None; broken pictures are skipped."""

@@ -3,6 +3,7 @@
 import errno
 import itertools
 import os
+import re
 from pathlib import Path
 
 import pytest
@@ -12,6 +13,7 @@ from gigabrain_zenoh.cli.config import merged_file, rows_of, with_values
 from gigabrain_zenoh.config.layers import Row
 from gigabrain_zenoh.errors import ConfigError, GigabrainError, UnknownName
 from gigabrain_zenoh.geometry.body_settings import split
+from gigabrain_zenoh.host.run_folders import new_run_dir
 from gigabrain_zenoh.launch.deployment import Deployment
 from gigabrain_zenoh.launch.merging import read_rows, write_rows
 
@@ -180,6 +182,62 @@ def test_the_settings_of_a_run_are_read_back(file: Path, tmp_path: Path) -> None
     assert [tuple(row) for row in read_rows(tmp_path)] == [tuple(row) for row in rows]
     with pytest.raises(ConfigError, match="cannot be read"):
         read_rows(tmp_path / "other")
+
+
+def test_only_the_robot_s_user_can_read_the_settings_of_a_run(tmp_path: Path) -> None:
+    before = os.umask(0)
+    try:
+        run_dir = new_run_dir(tmp_path, "demo")
+        write_rows(run_dir, [Row("seed", 3, "default")])
+    finally:
+        os.umask(before)
+    modes = [path.stat().st_mode & 0o777 for path in (run_dir, run_dir / "config.json")]
+    assert modes == [0o700, 0o600]
+
+
+CAMERA = "rtsp://admin:pass@word@cam.local:554/live?token=secret"
+SECRET = "word@|token=secret"
+CAMERAS = f'robot.real.cameras={{front: {{source: opencv, device: "{CAMERA}"}}}}'
+
+
+def test_the_settings_of_a_run_hold_no_password_of_an_address(
+    file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file.write_text(
+        "body: turtlebot3_waffle\nlink: real\n"
+        f"processes: {{mine: {{module: my.node, settings: {{urls: [{{a: '{CAMERA}'}}]}}}}}}\n"
+    )
+    words = ("config", str(file), "--set", CAMERAS, "--set", "robot.cameras=[{name: front}]")
+    make_app(words)(words, exit_on_error=False, print_error=False, result_action="return_value")
+    shown = capsys.readouterr().out
+    assert '"rtsp://cam.local:554"' in shown
+    assert not re.search(SECRET, shown)
+    rows = rows_of(merged_file(str(file), (), (words[3], words[5])))
+    write_rows(tmp_path, rows)
+    assert not re.search(SECRET, (tmp_path / "config.json").read_text())
+    values = {row.key: row.value for row in rows}
+    assert values["robot.real.cameras.front.device"] == "rtsp://cam.local:554"
+    assert values["processes.mine.settings.urls"] == [{"a": "rtsp://cam.local:554"}]
+
+
+@pytest.mark.parametrize(
+    ("given", "problem"),
+    [
+        (CAMERAS.replace("device", "devise"), "unknown field 'devise'"),
+        (CAMERAS.replace("opencv", CAMERA), "no camera source 'rtsp://…@cam.local"),
+        (f"robot.real.cameras={{'{CAMERA}': {{}}}}", "unknown field"),
+        (f"seed={CAMERA}", "expected a whole number"),
+        (f"seed: {CAMERA}", "no setting"),
+        ("seed: rtsp://admin:pass@word@cam.local", "expected KEY=VALUE"),
+        (f"seed=[{CAMERA}", "not YAML"),
+    ],
+)
+def test_an_error_holds_no_password_of_an_address(file: Path, given: str, problem: str) -> None:
+    file.write_text("body: turtlebot3_waffle\nlink: real\nrobot: {cameras: [{name: front}]}\n")
+    with pytest.raises(GigabrainError) as refused:
+        merged(file, given)
+    assert problem in str(refused.value)
+    assert "word@" not in str(refused.value)
 
 
 def test_a_full_disk_does_not_keep_a_robot_from_starting(

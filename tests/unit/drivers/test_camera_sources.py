@@ -226,6 +226,18 @@ def test_a_stream_is_named_by_its_host_alone(tmp_path: Path, address: str, shown
     assert str(caught.value) == f"{shown} cannot be opened"
 
 
+@pytest.mark.parametrize(
+    ("device", "shown"),
+    [("rtsp:/admin:se@cret@cam/live", "…@cam/live"), ("admin:secret@cam", "…@cam"), ("a@b", "a@b")],
+)
+def test_an_address_without_slashes_is_named_without_its_password(
+    tmp_path: Path, device: str, shown: str
+) -> None:
+    with pytest.raises(CameraLost) as caught:
+        camera(tmp_path, device).open()
+    assert str(caught.value) == f"{shown} is not there"
+
+
 @pytest.mark.parametrize("scheme", ["rtsp", "http", "https"])
 def test_a_silent_stream_does_not_keep_other_cameras_from_opening(
     tmp_path: Path, scheme: str

@@ -13,6 +13,19 @@ def test_a_library_whose_arguments_do_not_fit_loses_no_line() -> None:
     assert logs.fields(record, "control")["text"] == "%d beams ('many',)"
 
 
+def test_addresses_have_no_password() -> None:
+    try:
+        raise ValueError("no picture from rtsp://admin:pass@word@cam:554/live")
+    except ValueError as error:
+        about = (type(error), error, error.__traceback__)
+    record = logging.LogRecord("x", 20, "", 0, "%s, mail a@b", ("http://u:word@cam",), about)
+    record.data = {"value": "rtsp://u:word@cam", "count": 3}
+    found = logs.fields(record, "camera")
+    assert (found["text"], found["value"]) == ("http://…@cam, mail a@b", "rtsp://…@cam")
+    assert found["traceback"].endswith("no picture from rtsp://…@cam:554/live")
+    assert found["count"] == 3
+
+
 def test_a_console_line_reads_time_process_level_text_and_data() -> None:
     record = {
         "t": 1_700_000_000_000_000_000,

@@ -37,5 +37,11 @@ def test_a_record_of_another_library_has_a_level_and_a_time_of_ours(level: str, 
     assert logs.readable(record)
 
 
+def test_output_of_a_library_holds_no_password_of_an_address() -> None:
+    line = b"[ERROR] cannot find rtsp://admin:pass@word@cam:554/live in this file"
+    text = as_record(line, "camera")["text"]
+    assert text == "[ERROR] cannot find rtsp://…@cam:554/live in this file"
+
+
 def test_deeply_nested_output_is_text() -> None:
     assert as_record(b"[" * 100_000, "driver")["event"] == "output"
