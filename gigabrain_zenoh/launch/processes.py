@@ -1,8 +1,8 @@
 """The table of processes: one row contains the data for start, settings and rights of a process.
 
-A supervisor starts each as `python -m gigabrain_zenoh.launch.processes CONFIG`, with a
-ProcessConfig in JSON. Packages offer processes as entry points of the group
-`gigabrain.processes`; each is a ProcessType.
+A supervisor starts each as `python -m gigabrain_zenoh.launch.processes ABOUT`, with a
+ProcessConfig in JSON on its standard input; ABOUT names it for ps(1). Packages offer processes as
+entry points of the group `gigabrain.processes`; each is a ProcessType.
 """
 
 import contextlib
@@ -424,14 +424,14 @@ def run_process(config: ProcessConfig, make_bus: MakeBus = Bus) -> int:
 
 
 def main() -> None:
-    """Run a supervised process, configured by its first argument, and exit."""
+    """Run a supervised process, configured by its standard input, and exit."""
     this_process.set_up()
-    code = run_supervised(sys.argv[1])
+    code = run_supervised(sys.stdin.buffer.read())
     sys.stdout.flush()
     os._exit(code)  # Zenoh's threads must not keep a finished process alive
 
 
-def run_supervised(config: str) -> int:
+def run_supervised(config: str | bytes) -> int:
     """Run the process with a ProcessConfig in JSON, and return its exit code."""
     this_process.show_stack_on_request()
     interrupts.install()

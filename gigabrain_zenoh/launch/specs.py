@@ -59,11 +59,14 @@ def process_specs(
         )
         process = structs.replace(process, **own_config(deployment, name, file))
         compiles = row.compiles is not None and row.compiles(deployment)
+        config = msgspec.json.encode(process).decode()
+        about = msgspec.json.encode({"name": name, "run_dir": process.run_dir}).decode()
         specs.append(
             ProcessSpec(
                 name=name,
-                argv=(*COMMAND, msgspec.json.encode(process).decode()),
-                fork=_fork(row, process, compiles=compiles),
+                argv=(*COMMAND, about),
+                config=config,
+                fork=_fork(row, config, about, compiles=compiles),
                 after=after,
                 beats=True,
                 shows_stack=True,
@@ -77,15 +80,14 @@ def process_specs(
     return specs
 
 
-def _fork(row: ProcessType, process: ProcessConfig, *, compiles: bool) -> ForkRequest | None:
+def _fork(row: ProcessType, config: str, about: str, *, compiles: bool) -> ForkRequest | None:
     """Return the request to fork a process; None if a fork server may not start it."""
     if not row.forks:
         return None
-    about = msgspec.json.encode({"name": process.name, "run_dir": process.run_dir}).decode()
     modules = SHARED, row.run.partition(":")[0]
     return ForkRequest(
         run=FORKED,
-        argument=msgspec.json.encode(process).decode(),
+        argument=config,
         title=f"{FORKED} {about}",
         imports=(modules, (KERNELS,)) if compiles else (modules,),
     )

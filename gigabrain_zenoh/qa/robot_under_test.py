@@ -392,8 +392,8 @@ def reconfigured(
     spec: ProcessSpec, change: Callable[[ProcessConfig], ProcessConfig]
 ) -> ProcessSpec:
     """Return the same process with another configuration."""
-    config = change(msgspec.json.decode(spec.argv[-1], type=ProcessConfig))
-    return replace(spec, argv=(*spec.argv[:-1], msgspec.json.encode(config).decode()))
+    config = change(msgspec.json.decode(spec.config, type=ProcessConfig))
+    return replace(spec, config=msgspec.json.encode(config).decode())
 
 
 def rss_mb(pid: int) -> float:

@@ -62,15 +62,20 @@ class Child(asyncio.SubprocessProtocol):
         argv: Sequence[str],
         env: Mapping[str, str],
         on_record: Callable[[dict[str, Any]], None],
+        text: str = "",
     ) -> "Child":
-        """Start a process. Raises OSError."""
-        _, child = await asyncio.get_running_loop().subprocess_exec(
+        """Start a process with `text` on its standard input. Raises OSError."""
+        transport, child = await asyncio.get_running_loop().subprocess_exec(
             lambda: cls(name, on_record),
             *argv,
-            stdin=subprocess.DEVNULL,
+            stdin=subprocess.PIPE if text else subprocess.DEVNULL,
             env=dict(env),
             start_new_session=True,  # a terminal's Ctrl-C is for the supervisor alone
         )
+        if text:
+            pipe = cast(asyncio.WriteTransport, transport.get_pipe_transport(0))
+            pipe.write(text.encode())
+            pipe.close()  # once all is written
         return child
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
@@ -85,6 +90,8 @@ class Child(asyncio.SubprocessProtocol):
 
     def pipe_connection_lost(self, fd: int, exc: Exception | None) -> None:
         """Handle the end of output on `fd` (asyncio calls this)."""
+        if fd not in self._lines:  # its standard input
+            return
         if rest := self._lines.pop(fd).end():
             self._on_record(as_record(rest, self._name))
         if not self._lines:

@@ -61,14 +61,15 @@ class ProcessSpec:
     """One process to keep running, and the processes that must be ready before it starts."""
 
     name: str
-    argv: tuple[str, ...]
+    argv: tuple[str, ...]  # other users can see them
     after: tuple[str, ...] = ()
+    config: str = ""  # it reads this from its standard input; may hold passwords
     ready_timeout_s: float = 10.0
     stop_last: bool = False  # others need it for a clean end, as they need the router
     optional: bool = False  # the robot runs without it, also if its settings are wrong
     shows_stack: bool = False  # prints its stack on `this_process.STACK_SIGNAL`
     beats: bool = False  # reports progress once a second, and is killed without it
-    fork: ForkRequest | None = None  # the same as `argv`, for a fork server
+    fork: ForkRequest | None = None  # the same as `argv` and `config`, for a fork server
 
 
 @dataclass
@@ -182,8 +183,9 @@ class ManagedProcess:
             if spec.fork and shared.fork_servers:
                 child = await shared.fork_servers.start(spec.name, spec.fork, self._handle_record)
             if child is None:
+                environment = supervised_environment()
                 child = await Child.start(
-                    spec.name, spec.argv, supervised_environment(), self._handle_record
+                    spec.name, spec.argv, environment, self._handle_record, spec.config
                 )
             self.child, self.status.pid = child, child.pid
             return child

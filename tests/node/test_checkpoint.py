@@ -263,7 +263,7 @@ def test_each_simulated_run_has_its_own_checkpoint(
     for run_dir in (tmp_path / "one", tmp_path / "two"):
         specs = process_specs(Deployment(link=link), "robot", run_dir, tmp_path / "state")
         (spec,) = (one for one in specs if one.name == "driver")
-        settings = msgspec.json.decode(spec.argv[-1])["settings"]
+        settings = msgspec.json.decode(spec.config)["settings"]
         assert settings["checkpoint"] == (str(run_dir / "checkpoint") if kept else "")
 
 

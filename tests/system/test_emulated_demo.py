@@ -16,7 +16,7 @@ def specs(tmp_path: Path, link: str) -> dict[str, tuple[tuple[str, ...], Process
     deployment = msgspec.convert({"body": "mycustombot", "link": link}, Deployment)
     found = process_specs(deployment, "robot", tmp_path, tmp_path / "state")
     return {
-        spec.name: (spec.after, msgspec.json.decode(spec.argv[-1], type=ProcessConfig))
+        spec.name: (spec.after, msgspec.json.decode(spec.config, type=ProcessConfig))
         for spec in found
     }
 

@@ -227,8 +227,8 @@ async def test_a_robot_with_a_button_moves_only_while_the_button_publishes(tmp_p
 def test_a_deployment_runs_the_button_beside_the_driver(tmp_path: Path) -> None:
     deployment = Deployment(button=ButtonConfig(port="/dev/ttyUSB0"))
     specs = {spec.name: spec for spec in process_specs(deployment, "robot", tmp_path, tmp_path)}
-    assert '"settings":{"port":"/dev/ttyUSB0"}' in specs["button"].argv[-1]
-    assert '"button":true' in specs["driver"].argv[-1]
+    assert '"settings":{"port":"/dev/ttyUSB0"}' in specs["button"].config
+    assert '"button":true' in specs["driver"].config
     assert "button" not in {
         spec.name for spec in process_specs(Deployment(), "robot", tmp_path, tmp_path)
     }

@@ -89,7 +89,7 @@ def test_deployment_files_can_have_its_settings_which_are_checked(tmp_path: Path
     placed = "hosts: {robot: [router, driver, lamp]}\n"
     deployment = load_deployment(written(tmp_path, placed + "lamp: {port: /dev/lamp}\n"))
     spec = process_specs(deployment, "robot", tmp_path, tmp_path / "state")[-1]
-    process = msgspec.json.decode(spec.argv[-1], type=ProcessConfig)
+    process = msgspec.json.decode(spec.config, type=ProcessConfig)
     assert process.settings == {"port": "/dev/lamp", "state_dir": str(tmp_path / "state")}
     assert (spec.name, spec.after, spec.beats) == ("lamp", ("router",), True)
     with pytest.raises(ConfigError, match=r"robot\.yaml:2: lamp\.port: expected a string, got 7"):

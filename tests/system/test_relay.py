@@ -25,7 +25,7 @@ BRAIN: tuple[str, ...] = ("perception", "decision")
 
 def configs(deployment: Deployment, host: str, folder: Path) -> dict[str, ProcessConfig]:
     specs = process_specs(deployment, host, folder, folder)
-    return {s.name: msgspec.json.decode(s.argv[-1], type=ProcessConfig) for s in specs}
+    return {s.name: msgspec.json.decode(s.config, type=ProcessConfig) for s in specs}
 
 
 @pytest.mark.parametrize(

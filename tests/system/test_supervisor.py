@@ -49,6 +49,29 @@ say('ready'); wait()"""
         assert supervisor.deaths == 0
 
 
+async def test_a_process_reads_its_configuration_where_other_users_cannot_see_it() -> None:
+    config = "secret ü" * 40_000  # more than a pipe holds
+    code = "read = sys.stdin.buffer.read().decode(); say('read', text=f'{len(read)} {read[-8:]}'); "
+    async with running(spec("camera", code + SERVE, config=config)) as (supervisor, records):
+        status = supervisor.statuses["camera"]
+        for starts in (1, 2):  # a restart reads it again
+            await until(lambda: status.restarts == starts - 1 and status.state == "ready")  # noqa: B023
+            assert records.texts("read") == ["320000 secret ü"] * starts
+            assert status.pid
+            os.kill(status.pid, signal.SIGKILL)
+
+
+async def test_a_process_need_not_read_its_configuration() -> None:
+    config = "x" * 400_000
+    async with running(
+        spec("camera", "os.close(0); " + SERVE, config=config),
+        spec("lamp", "sys.exit(7)", config=config),
+    ) as (supervisor, _):
+        await until(lambda: supervisor.statuses["camera"].state == "ready")
+        await until(lambda: supervisor.statuses["lamp"].state == "given up")
+        assert supervisor.statuses["lamp"].last_exit == 7
+
+
 async def test_a_dead_process_is_restarted() -> None:
     async with running(spec("control")) as (supervisor, records):
         status = supervisor.statuses["control"]
@@ -115,9 +138,9 @@ def used_s() -> float:
 
 async def test_a_crash_loop_costs_no_more_cpu_than_five_starts() -> None:
     """Use the real pauses, and a real process that fails when it reads its configuration."""
-    crasher = ProcessSpec("control", (*COMMAND, "{"))
+    crasher = ProcessSpec("control", COMMAND, config="{")
     before_s = used_s()
-    once = functools.partial(subprocess.run, capture_output=True, check=False)
+    once = functools.partial(subprocess.run, capture_output=True, check=False, input=b"{")
     assert (await asyncio.to_thread(once, crasher.argv)).returncode
     one_s = used_s() - before_s
     before_s += one_s

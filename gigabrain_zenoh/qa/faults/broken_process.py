@@ -1,8 +1,8 @@
 """Runs a robot's process with one broken part: published or received messages, or clocks.
 
-Started as `python -m gigabrain_zenoh.qa.faults.broken_process KIND CONFIG` instead of the process
-itself. KIND is `hanging`, a kind of `CLOCK_SKEWS`, or comma-separated names of `TAMPERINGS`. The
-machine's own clock does not change.
+Started as `python -m gigabrain_zenoh.qa.faults.broken_process KIND ABOUT` instead of the process
+itself, with the same standard input. KIND is `hanging`, a kind of `CLOCK_SKEWS`, or comma-separated
+names of `TAMPERINGS`. The machine's own clock does not change.
 """
 
 import functools
@@ -246,6 +246,7 @@ def run_broken(kind: str, config: ProcessConfig) -> int:
 
 if __name__ == "__main__":
     this_process.die_with_supervisor()
-    code = run_broken(sys.argv[1], msgspec.json.decode(sys.argv[2], type=ProcessConfig))
+    config = msgspec.json.decode(sys.stdin.buffer.read(), type=ProcessConfig)
+    code = run_broken(sys.argv[1], config)
     sys.stdout.flush()
     os._exit(code)  # Zenoh's threads must not keep a finished process alive

@@ -205,6 +205,16 @@ def test_the_camera_s_process_runs_beside_the_driver_unless_it_is_placed(tmp_pat
     assert names(placed, "eye") == ["camera"]
 
 
+def test_the_arguments_of_a_process_hold_no_password(tmp_path: Path) -> None:
+    source = {"source": "opencv", "device": "rtsp://admin:secret@cam/live"}
+    robot = {"real": {"cameras": {"rear": source}}}
+    deployment = Deployment(cameras=True, link="real", robot=robot)
+    specs = {one.name: one for one in process_specs(deployment, "robot", tmp_path, tmp_path)}
+    assert all("secret" in specs[name].config for name in ("driver", "camera"))
+    shown = [text for one in specs.values() for text in (*one.argv, one.fork and one.fork.title)]
+    assert not any("secret" in text for text in shown if text)
+
+
 def test_a_camera_takes_pictures_at_its_rate() -> None:
     def ticks(rate_hz: float) -> list[int]:
         return [tick for tick in range(1, 101) if exposes(rate_hz, tick)]

@@ -16,7 +16,7 @@ ROS = Ros2Config()
 
 def specs(deployment, tmp_path, host="robot"):
     found = process_specs(deployment, host, tmp_path, tmp_path)
-    return {spec.name: (spec, json.loads(spec.argv[-1])) for spec in found}
+    return {spec.name: (spec, json.loads(spec.config)) for spec in found}
 
 
 def test_a_part_of_the_file_starts_it_beside_the_driver_unless_it_is_placed(tmp_path):

@@ -66,9 +66,9 @@ def test_the_only_host_runs_it_and_its_row_is_like_ours(tmp_path: Path) -> None:
     *ours, spec = process_specs(deployment, "robot", tmp_path, tmp_path, file=str(path))
     assert (spec.name, spec.after, spec.beats, spec.optional) == ("mine", ("router",), True, True)
     assert not any(one.optional for one in ours)
-    config = msgspec.json.decode(spec.argv[-1], type=ProcessConfig)
+    config = msgspec.json.decode(spec.config, type=ProcessConfig)
     assert (config.module, config.settings) == ("my_lamp.node", {"watts": 7})
-    router = msgspec.json.decode(ours[0].argv[-1], type=ProcessConfig)
+    router = msgspec.json.decode(ours[0].config, type=ProcessConfig)
     assert router.settings["watches"] == ["mine"]
     assert router.endpoint.grants["mine"] == ("robot/lamp/**",)
 

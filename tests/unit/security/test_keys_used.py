@@ -153,7 +153,7 @@ def test_the_router_listens_where_it_is_told_and_on_a_socket_of_its_user(
 ) -> None:
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
     deployment = Deployment(keys=str(fleet / "robot@red"), namespace="red", fleet=("blue",))
-    router = process_specs(deployment, "robot", tmp_path, tmp_path)[0].argv[-1]
+    router = process_specs(deployment, "robot", tmp_path, tmp_path)[0].config
     assert '"listen":["tls/127.0.0.1:7447","unixsock-stream/' in router
     assert '"robot@blue"' in router
 
