@@ -17,7 +17,7 @@ from gigabrain_zenoh.bus.listening import Sampled
 from gigabrain_zenoh.codec import Codec
 from gigabrain_zenoh.host.bounded import put_newest
 
-MAX_RECENT_PICTURES = 8  # per camera; detections arrive up to 0.5 s after their picture
+MAX_RECENT_PICTURES, MAX_RECENT_TICKS = 32, 25  # per camera; detections come up to 0.5 s later
 _decode_image = Codec(IMAGE.type, IMAGE.max_bytes).decode
 
 
@@ -31,7 +31,8 @@ class CameraFeed:
         self._bus, self._topics = bus, topics
         self._sampled: dict[Topic[Any], dict[str, Sampled[Any]]] = {}
         self._detections: dict[str, Detections] = {}  # not read yet, by camera
-        self._recent: dict[str, deque[bytes]] = {}  # the newest pictures, by camera
+        # basis and payload of the newest pictures, by camera
+        self._recent: dict[str, deque[tuple[int, bytes]]] = {}
         self._closes: list[Callable[[], None]] = []
 
     def watch(self, on: bool) -> None:
@@ -63,8 +64,8 @@ class CameraFeed:
 
     def picture_at(self, camera: str, basis: int) -> Image | None:
         """Return the picture with this basis, if it is one of the newest."""
-        for payload in reversed(tuple(self._recent.get(camera, ()))):
-            if header_of(payload).basis == basis:
+        for of, payload in reversed(tuple(self._recent.get(camera, ()))):
+            if of == basis:
                 with suppress(ValueError):
                     return _decode_image(payload)
         return None
@@ -81,7 +82,14 @@ class CameraFeed:
             sampled = by_name.setdefault(name, Sampled(self._bus, topic))
             sampled.receive(key, encoding, payload)
             if topic is IMAGE and DETECTIONS in self._topics:
-                self._recent.setdefault(name, deque(maxlen=MAX_RECENT_PICTURES)).append(payload)
+                self._keep(name, header_of(payload).basis, payload)
+
+    def _keep(self, camera: str, basis: int, payload: bytes) -> None:
+        """Keep a picture, and drop those that are too old for detections."""
+        recent = self._recent.setdefault(camera, deque(maxlen=MAX_RECENT_PICTURES))
+        recent.append((basis, payload))
+        while basis - recent[0][0] > MAX_RECENT_TICKS:
+            recent.popleft()
 
     def _add_detections(self, _key: str, found: Detections) -> None:
         put_newest(self._detections, found.camera, found, MAX_CAMERAS)
