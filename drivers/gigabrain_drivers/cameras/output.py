@@ -11,7 +11,7 @@ from gigabrain_schemas.base import Cause
 from gigabrain_schemas.body import Camera
 from gigabrain_schemas.sensors import Image
 from gigabrain_schemas.topics import CAMERA, DEPTH, IMAGE
-from gigabrain_schemas.vision import CameraInfo, DepthImage, pack_depth
+from gigabrain_schemas.vision import MAX_PLANE_BYTES, CameraInfo, DepthImage, pack_depth
 from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.logs import Fault
 from gigabrain_zenoh.vision import camera_health
@@ -153,10 +153,12 @@ class CameraOutput:
 
 
 def _too_large(picture: Image | None, depth: DepthImage | None) -> str:
-    """Return which message exceeds the limit of its topic; empty if none does."""
+    """Return which message, or part of it, is larger than readers accept; empty if none is."""
+    planes = [len(plane) for plane in depth.planes] if depth else [0]
     sizes = (
         ("a picture", len(picture.data) if picture else 0, IMAGE.max_bytes),
-        ("a depth picture", sum(map(len, depth.planes)) if depth else 0, DEPTH.max_bytes),
+        ("a depth picture", sum(planes), DEPTH.max_bytes),
+        ("a plane of depth", max(planes), MAX_PLANE_BYTES),
     )
     for what, size, limit in sizes:
         if size > limit - HEADER_BYTES:

@@ -217,6 +217,9 @@ def test_a_pipe_and_a_folder_are_no_cameras(tmp_path: Path, make: Callable[[str]
         ("rtsp://admin:secret@127.0.0.1:9/live?token=secret", "rtsp://127.0.0.1:9"),
         ("http://127.0.0.1:9?to=me@x.org&pw=secret", "http://…"),
         ("rtsp://admin:se/cret@127.0.0.1:9/live", "rtsp://…"),
+        ("rtsp://127.0.0.1:99999/live", "rtsp://127.0.0.1:99999"),
+        ("rtsp://" + 70 * "x" + "/live", "rtsp://" + 70 * "x"),
+        ("nothing://127.0.0.1", "nothing://127.0.0.1"),
     ],
 )
 def test_a_stream_is_named_by_its_host_alone(tmp_path: Path, address: str, shown: str) -> None:
