@@ -4,7 +4,7 @@ import asyncio
 import time
 
 from gigabrain_zenoh.cli.options import LOCAL, RobotAddress, on_bus, print_line
-from gigabrain_zenoh.errors import ConfigError
+from gigabrain_zenoh.errors import ConfigError, GigabrainError
 from gigabrain_zenoh.host.signals import run_async
 
 NOT_LINKED = (
@@ -126,13 +126,17 @@ async def _compile(name: str, *warm_ups: str, links: bool) -> None:
     from gigabrain_zenoh.kernels import cache
     from gigabrain_zenoh.kernels import precompile as kernels
 
-    start_s = time.monotonic()
+    start_s, before = time.monotonic(), cache.digest(cache.PACKAGE)
     for warm_up in warm_ups:
         if await kernels.compile_in_child(warm_up):
             try:
                 kernels.compile_all(warm_up)  # raises the reason of the failure
             except ModuleNotFoundError as error:
                 raise kernels.missing_package(error) from None
+    if cache.digest.__wrapped__(cache.PACKAGE) != before:  # read again, not cached
+        raise GigabrainError(
+            f"{name}: sources changed while they were compiled; run `gigabrain precompile` again"
+        )
     if not all(map(kernels.is_kept, warm_ups)):
         raise ConfigError(
             f"{name}: compiled, but not kept: cannot write {cache.kernel_folder()}; "

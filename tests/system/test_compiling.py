@@ -14,7 +14,7 @@ pytest.importorskip("numba")
 
 from gigabrain_zenoh.cli import map as map_commands
 from gigabrain_zenoh.decision.drive_kernels import ARM_KERNELS, CAR_KERNELS, DRIVE_KERNELS
-from gigabrain_zenoh.errors import ConfigError
+from gigabrain_zenoh.errors import ConfigError, GigabrainError
 from gigabrain_zenoh.kernels import cache as kernels
 from gigabrain_zenoh.kernels import jit, precompile
 from gigabrain_zenoh.perception.node import LOCALIZE_KERNELS, MAP_KERNELS
@@ -117,6 +117,24 @@ async def test_precompile_fails_if_the_kernels_cannot_be_cached(
     fault = f"compiled, but not kept: cannot write {folder}; make room there, or "
     fault += "name another folder with NUMBA_CACHE_DIR"
     with pytest.raises(ConfigError, match=f"^mapping: {fault}$"):
+        await map_commands._compile("mapping", WARM_UP, links=True)
+
+
+async def test_precompile_says_that_sources_changed_while_they_were_compiled(
+    calls: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    source = tmp_path / "package" / "mapping" / "grid.py"
+    source.parent.mkdir(parents=True)
+    source.write_text("")
+    monkeypatch.setattr(kernels, "PACKAGE", tmp_path / "package")
+
+    async def in_child(_: str) -> int:
+        source.write_text("CELLS = 2\n")
+        return 0
+
+    monkeypatch.setattr(precompile, "compile_in_child", in_child)
+    fault = "sources changed while they were compiled; run `gigabrain precompile` again"
+    with pytest.raises(GigabrainError, match=f"^mapping: {fault}$"):
         await map_commands._compile("mapping", WARM_UP, links=True)
 
 
