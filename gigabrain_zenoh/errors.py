@@ -18,7 +18,12 @@ GigabrainError
 
 import difflib
 import re
+from bisect import bisect_right
 from collections.abc import Iterable
+from itertools import accumulate
+
+MAX_LIST_CHARS = 300  # of the names that an error lists
+MAX_UNKNOWN_CHARS = 450  # of the error for an unknown name; replies hold 500
 
 LOGIN = re.compile(r"(?<=://)[^\s\"']*@")  # of an address in a text; a password may hold any of :/@
 
@@ -113,6 +118,19 @@ def unknown(kind: str, name: str, known: Iterable[str]) -> UnknownName:
     parts = {part: whole for whole in names for part in (*whole.split("_"), whole)}
     close = difflib.get_close_matches(name, parts, n=1, cutoff=0.6)
     hint = f"; did you mean {parts[close[0]]!r}?" if close else ";"
-    text = f"no {kind} {name!r}{hint} known: {', '.join(names) or 'none'}"
+    start = f"no {kind} {name!r}{hint} known: "
+    text = start + listed(names, MAX_UNKNOWN_CHARS - len(start))
     text = text.encode(errors="replace").decode()  # file names may contain any bytes
     return UnknownName(text, value=name)
+
+
+def listed(names: Iterable[str], most_chars: int = MAX_LIST_CHARS) -> str:
+    """Return names as text for an error, such as `left, right and 3 more`; `none` without any.
+
+    At least one name is whole, and the whole names have at most `most_chars` characters.
+    """
+    known = list(names)
+    ends = list(accumulate(len(name) + len(", ") for name in known))
+    shown = max(1, bisect_right(ends, most_chars))
+    text, more = ", ".join(known[:shown]), len(known) - shown
+    return f"{text} and {more} more" if more > 0 else text or "none"

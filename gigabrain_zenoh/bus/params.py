@@ -7,7 +7,7 @@ from typing import NamedTuple, TypeVar
 import msgspec
 
 from gigabrain_schemas.requests import Param
-from gigabrain_zenoh.errors import Refused
+from gigabrain_zenoh.errors import Refused, listed
 
 S = TypeVar("S", bound=msgspec.Struct)
 Get = Callable[[], str]
@@ -69,8 +69,7 @@ class Params:
         if name not in self._known:
             near = difflib.get_close_matches(name, self._known, n=1, cutoff=0.5)
             hint = f"; did you mean {near[0]!r}?" if near else ";"
-            known = ", ".join(self._known)
-            raise Refused(f"no parameter {name!r}{hint} known: {known}")
+            raise Refused(f"no parameter {name!r}{hint} known: {listed(self._known)}")
         entry = self._known[name]
         before = entry.get()
         try:

@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from gigabrain_schemas.base import TICK_S
 from gigabrain_schemas.body import BodyDescription, JointDescription, RobotState
 from gigabrain_schemas.brain import JointCommand
-from gigabrain_zenoh.errors import BodyLost, ConfigError, Unsupported, unknown
+from gigabrain_zenoh.errors import BodyLost, ConfigError, Unsupported, listed, unknown
 from gigabrain_zenoh.geometry.joint_ramp import (
     REST,
     JointGoal,
@@ -40,7 +40,7 @@ def checked_positions(body: BodyDescription, positions: Positions) -> dict[str, 
     prepare(len(body.joints))
     known = {joint.name: joint for joint in body.joints}
     if not positions:
-        raise ConfigError(f"expected the position of a joint; known: {', '.join(known)}")
+        raise ConfigError(f"expected the position of a joint; known: {listed(known)}")
     for name, position in positions.items():
         if name not in known:
             raise unknown("joint", name, known)

@@ -14,7 +14,7 @@ from msgspec.structs import replace
 
 from gigabrain_schemas.arrays import Floats
 from gigabrain_schemas.body import BodyDescription, JointDescription
-from gigabrain_zenoh.errors import Refused
+from gigabrain_zenoh.errors import Refused, listed
 from gigabrain_zenoh.gateway.conversions.frames import stamp_ns
 from gigabrain_zenoh.geometry.joint_ramp import OVER, JointPoint
 
@@ -169,10 +169,10 @@ def judged(
 def _joints(body: BodyDescription, names: Sequence[str]) -> tuple[JointDescription, ...]:
     known = {joint.name: joint for joint in body.joints}
     if not names:
-        raise Unfit(Code.INVALID_JOINTS, f"it names no joint; known: {', '.join(known)}")
+        raise Unfit(Code.INVALID_JOINTS, f"it names no joint; known: {listed(known)}")
     for name in names:
         if name not in known:
-            text = f"no joint {name[:60]!r}; known: {', '.join(known)}"
+            text = f"no joint {name[:60]!r}; known: {listed(known)}"
             raise Unfit(Code.INVALID_JOINTS, text)
     if len(set(names)) < len(names):
         raise Unfit(Code.INVALID_JOINTS, "it names a joint twice")

@@ -13,7 +13,7 @@ from rosbags.interfaces import Nodetype
 from rosbags.typesys.base import normalize_fieldname
 from rosbags.typesys.store import Typestore
 
-from gigabrain_zenoh.errors import BadPayload, ConfigError
+from gigabrain_zenoh.errors import BadPayload, ConfigError, listed
 from gigabrain_zenoh.ros2.type_files import DUMMY, Description
 
 BYTES = ("uint8", "char", "byte")
@@ -49,7 +49,7 @@ class Values:
         ]
         if not fields.keys() <= plan.keys():
             wrong = ", ".join(sorted(fields.keys() - plan.keys()))
-            raise ConfigError(f"{name} has no field {wrong}; it has: {', '.join(plan)}")
+            raise ConfigError(f"{name} has no field {wrong}; it has: {listed(plan)}")
         return self._store.types[name](*values)
 
     def from_dict(self, name: str, data: Any, path: str = "") -> Any:
@@ -59,7 +59,7 @@ class Values:
             raise BadPayload(f"{path or name}: expected an object, got {_short(data)}")
         if wrong := data.keys() - plan.keys():
             each = ", ".join(sorted(map(str, wrong)))
-            raise BadPayload(f"{path or name}: no field {each}; known: {', '.join(plan)}")
+            raise BadPayload(f"{path or name}: no field {each}; known: {listed(plan)}")
         values = [
             self._checked(kind, data[field], f"{path}.{field}" if path else field)
             if field in data

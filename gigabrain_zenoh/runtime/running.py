@@ -14,7 +14,7 @@ from msgspec import Meta, Struct, structs
 from gigabrain_zenoh.bus.zenoh.config import SECURE, secured
 from gigabrain_zenoh.codec import DECODE_ERRORS
 from gigabrain_zenoh.config.settings import Endpoint
-from gigabrain_zenoh.errors import Ambiguous, BusError, ConfigError
+from gigabrain_zenoh.errors import Ambiguous, BusError, ConfigError, listed
 from gigabrain_zenoh.host.files import expanded, open_regular
 from gigabrain_zenoh.host.posix import fcntl
 from gigabrain_zenoh.security.identity_files import check_files
@@ -161,7 +161,7 @@ def find_running(namespace: str = "") -> Running:
     here = running()
     robots = [r for r in here if not namespace or r.endpoint.namespace == namespace]
     if here and not robots:
-        names = ", ".join(sorted({r.endpoint.namespace or "none" for r in here}))
+        names = listed(sorted({r.endpoint.namespace or "none" for r in here}))
         raise BusError(
             f"no robot runs here with namespace {namespace!r}; known: {names}; "
             "for one of another router, use --connect (in a script connect=)"

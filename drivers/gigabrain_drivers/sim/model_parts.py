@@ -13,7 +13,7 @@ import mujoco
 import numpy as np
 
 from gigabrain_drivers.sim.body import PartNames, SimBody, SimModel
-from gigabrain_zenoh.errors import ConfigError
+from gigabrain_zenoh.errors import ConfigError, listed
 
 OBJECTS = {
     "body": mujoco.mjtObj.mjOBJ_BODY,
@@ -79,9 +79,10 @@ class PartFinder:
         if near:
             hint = f"; did you mean {near[0]!r}?"
         elif key in self._body.names:
-            hint = f", it has {', '.join(names) or 'none'}"
+            hint = f", it has {listed(names)}"
         else:
-            hint = f", name it in `names: {{{key}: …}}`: {', '.join(names) or 'it has none'}"
+            has = listed(names) if names else "it has none"
+            hint = f", name it in `names: {{{key}: …}}`: {has}"
         self._problem(f"no {kind} {name!r} ({key}){hint}", name if key in self._body.names else "")
 
     def _problem(self, text: str, value: str = "") -> None:
@@ -114,7 +115,7 @@ class PartFinder:
                 near = difflib.get_close_matches(key, known, 1, 0.5)
                 hint = f"; did you mean {near[0]!r}?" if near else ";"
                 value = given if isinstance(given, str) else given.joint
-                self._problem(f"no part {key!r}{hint} parts: {', '.join(known)}", value)
+                self._problem(f"no part {key!r}{hint} parts: {listed(known)}", value)
             elif not isinstance(given, str) and key in self._others():
                 self._problem(f"one name for {key}, not a joint and an actuator", given.joint)
 

@@ -21,7 +21,7 @@ from gigabrain_drivers.sim.truth import Truth
 from gigabrain_drivers.sim.world import ClosedPath, Colour, Pose, WalkingPath, World
 from gigabrain_drivers.sim.world_file import MATERIALS
 from gigabrain_schemas.sim import Thing
-from gigabrain_zenoh.errors import Refused
+from gigabrain_zenoh.errors import Refused, listed
 
 MIN_GAP_M = 0.02  # between the robot's outline and a new thing
 MARGIN_M = 1.0  # things may stand this far outside the floor
@@ -112,8 +112,7 @@ class Things:
     def remove(self, name: str) -> Thing:
         """Remove a thing. Raises Refused listing the existing ones."""
         if name not in self._used:
-            known = ", ".join(self._used) or "none"
-            raise Refused(f"no object {name!r} was added; known: {known}")
+            raise Refused(f"no object {name!r} was added; known: {listed(self._used)}")
         used = self._used.pop(name)
         self._walk(used.body, None)
         self._hide(used.body)

@@ -28,7 +28,7 @@ from gigabrain_drivers.sim.world import (
 )
 from gigabrain_zenoh.config import loading as config
 from gigabrain_zenoh.config.loading import nearest
-from gigabrain_zenoh.errors import ConfigError
+from gigabrain_zenoh.errors import ConfigError, listed
 from gigabrain_zenoh.host.files import expanded
 
 MAX_DISTANCE_M = 400.0  # from the origin to anything in a world
@@ -312,7 +312,7 @@ class WorldFile(_Part, frozen=True, kw_only=True):
         for part in ("walls", "boxes", "cylinders", "balls", "cans"):
             for number, one in enumerate(getattr(self, part)):
                 if one.material not in known:
-                    hint = nearest(one.material, known) or f"; known: {', '.join(known)}"
+                    hint = nearest(one.material, known) or f"; known: {listed(known)}"
                     raise ValueError(f"{part}[{number}]: no material {one.material!r}{hint}")
 
 
