@@ -10,7 +10,7 @@ from cyclopts import Parameter
 
 from gigabrain_schemas.body import BodyDescription, Joint, JointDescription, RobotState
 from gigabrain_schemas.requests import GateReply
-from gigabrain_zenoh.cli.options import LOCAL, RobotAddress, Take, print_line
+from gigabrain_zenoh.cli.options import LOCAL, RobotAddress, Take, check_name, print_line
 from gigabrain_zenoh.cli.task import Mode, Wait, send
 from gigabrain_zenoh.client.arm import held_posture
 from gigabrain_zenoh.client.robot import Robot
@@ -68,6 +68,8 @@ def jog(joint: str, distance: Distance, /, *, take: Take = False, at: RobotAddre
         distance: Distance from the last commanded position; may be negative. For a limp joint:
             distance from its measured position.
     """
+
+    check_name("JOINT", joint)
 
     async def move(robot: Robot) -> None:
         body = await _arm(robot)

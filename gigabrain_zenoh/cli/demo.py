@@ -30,7 +30,7 @@ from gigabrain_zenoh.config.loading import beside, located
 from gigabrain_zenoh.config.settings import LinkName, PageConfig, Resume
 from gigabrain_zenoh.decision import behaviours
 from gigabrain_zenoh.errors import ConfigError
-from gigabrain_zenoh.host.files import check_picture_path
+from gigabrain_zenoh.host.files import check_new_file, check_picture_path
 from gigabrain_zenoh.host.signals import run_async
 from gigabrain_zenoh.launch.deployment import (
     Deployment,
@@ -151,8 +151,8 @@ def demo(*, robot: RobotOptions = ROBOT, view: ViewOptions = VIEW) -> int:
     from gigabrain_zenoh.launch.demo import Demo, DemoOptions, only_host, with_page
 
     robot.check()
-    if view.record and view.record.exists():
-        raise ConfigError(f"--record: {view.record} exists; choose another file")
+    if view.record:
+        check_new_file(view.record)
     values = robot.values() | (recorded(view.record) if view.record else {})
     checked(values, Deployment)
     merged = merged_values(values, robot.settings, robot.set)

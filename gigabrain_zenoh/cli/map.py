@@ -3,7 +3,7 @@
 import asyncio
 import time
 
-from gigabrain_zenoh.cli.options import LOCAL, RobotAddress, on_bus, print_line
+from gigabrain_zenoh.cli.options import LOCAL, RobotAddress, checked, on_bus, print_line
 from gigabrain_zenoh.errors import ConfigError, GigabrainError
 from gigabrain_zenoh.host.signals import run_async
 
@@ -23,9 +23,11 @@ def save(name: str, /, *, at: RobotAddress = LOCAL, replace: bool = False) -> No
         name: Name of the files: NAME.yaml and NAME.pgm for ROS, NAME.graph.npz to continue.
         replace: Replace a map of the same name.
     """
+    from gigabrain_schemas.requests import MapRequest
     from gigabrain_zenoh.client.zones import save_map
     from gigabrain_zenoh.host.this_process import user_name
 
+    checked({"name": name}, MapRequest, positional=("name",))
     user = user_name()
     print_line(on_bus(at, lambda bus: save_map(bus, name, replace=replace, source=user)))
 
@@ -58,9 +60,11 @@ def load(name: str, /, *, proceed: bool = False, at: RobotAddress = LOCAL) -> No
         name: Name of the map.
         proceed: Continue mapping from it. Default: only localize in it.
     """
+    from gigabrain_schemas.zones import MapLoadRequest
     from gigabrain_zenoh.client.zones import load_map
     from gigabrain_zenoh.host.this_process import user_name
 
+    checked({"name": name}, MapLoadRequest, positional=("name",))
     user, mapping = user_name(), "slam" if proceed else "localize"
     print_line(on_bus(at, lambda bus: load_map(bus, name, mapping=mapping, source=user)))
 

@@ -12,6 +12,8 @@ from gigabrain_zenoh.cli.options import (
     Process,
     ProcessOrAll,
     RobotAddress,
+    check_name,
+    checked,
     on_bus,
     print_json,
     print_line,
@@ -57,6 +59,7 @@ def info(process: Process, /, *, at: RobotAddress = LOCAL) -> None:
     """
     from gigabrain_zenoh.diagnostics.discovery import describe
 
+    check_name("PROCESS", process)
     for line in describe(_find(at), process):
         print_line(line)
 
@@ -181,6 +184,8 @@ def get_param(process: Process, name: str, /, *, at: RobotAddress = LOCAL) -> No
     Args:
         name: Name of the parameter.
     """
+    check_name("PROCESS", process)
+    check_name("NAME", name)
     reply = ask_params(at, process)[process]
     params = {one.name: one for one in reply.params}
     if name not in params:
@@ -206,8 +211,12 @@ def set_param(
         value: New value.
         save: File to save it in, with all other changed parameters; see `param save`.
     """
+    from gigabrain_schemas.requests import ParamRequest
     from gigabrain_zenoh.cli.config import with_values
 
+    check_name("PROCESS", process)
+    check_name("NAME", name)
+    checked({"value": value}, ParamRequest, positional=("value",))
     check_result_path(save)
     if save:
         with_values(save, {})  # raises if the file is not a settings file
@@ -230,6 +239,7 @@ def save_params(file: Path, /, *, at: RobotAddress = LOCAL) -> None:
     from gigabrain_zenoh.cli.config import with_values
 
     check_result_path(file)
+    with_values(file, {})  # raises if the file is not a settings file
     params = [one for reply in ask_params(at).values() for one in reply.params if one.key]
     changed = {one.key: one.value for one in params if one.value != one.initial}
     if not changed:

@@ -8,10 +8,12 @@ from cyclopts import Parameter
 from gigabrain_zenoh.cli.options import (
     LOCAL,
     RobotAddress,
+    checked,
     on_bus,
     print_json,
     print_line,
 )
+from gigabrain_zenoh.errors import ConfigError
 
 if TYPE_CHECKING:
     from gigabrain_schemas.objects import ObjectMap
@@ -42,7 +44,12 @@ def objects(
     from gigabrain_zenoh.client.objects import forget_objects, known_objects
 
     if forget or forget_tag or forget_all:
+        from gigabrain_schemas.objects import ObjectsRequest
+
+        if forget_all and (forget or forget_tag):
+            raise ConfigError("choose --forget-all, or --forget and --forget-tag")
         fields = {"ids": forget, "tags": forget_tag, "everything": forget_all}
+        checked(fields, ObjectsRequest, {"ids": "forget", "tags": "forget_tag"})
         print_line(on_bus(at, lambda bus: forget_objects(bus, **fields), _name()))
         return
     found = on_bus(at, known_objects)
@@ -65,8 +72,11 @@ def pose(x: Number, y: Number, yaw: Number | None = None, /, *, at: RobotAddress
         y: Place in the map [m].
         yaw: Heading [rad], within about 0.5 rad. Default: any.
     """
+    from gigabrain_schemas.requests import PoseRequest
     from gigabrain_zenoh.client.objects import set_pose
 
+    values = {"x": x, "y": y, "yaw": yaw}
+    checked(values, PoseRequest, positional=values)
     found = on_bus(at, lambda bus: set_pose(bus, x, y, yaw), _name())
     print_line(f"localized at ({found.x:.2f}, {found.y:.2f}), {found.yaw:.2f} rad")
 

@@ -2,7 +2,7 @@
 
 import math
 import re
-from collections.abc import Awaitable, Callable, Iterable, Mapping
+from collections.abc import Awaitable, Callable, Collection, Iterable, Mapping
 from contextlib import AbstractAsyncContextManager
 from dataclasses import dataclass
 from pathlib import Path
@@ -39,6 +39,8 @@ T = TypeVar("T", bound="Struct")
 R = TypeVar("R")
 
 COMPLETION_TIMEOUT_S = 0.3  # a shell waits for the names
+MAX_NAME_CHARS = 64
+MAX_SHOWN_CHARS = 60  # of a value in an error
 PIPE_COLUMNS = 160  # width of tables in a pipe
 UNIT = re.compile("_(s|mb)$")  # suffix of settings that their options do not have
 
@@ -170,7 +172,10 @@ KeepStuck = Annotated[
 
 
 def checked(
-    values: Mapping[str, object], type: type[T], options: Mapping[str, str] | None = None
+    values: Mapping[str, object],
+    type: type[T],
+    options: Mapping[str, str] | None = None,
+    positional: Collection[str] = (),
 ) -> T:
     """Convert `values` to a `type`. Raises ConfigError, which names the invalid option.
 
@@ -178,23 +183,41 @@ def checked(
         values: Settings by their names.
         type: Struct of the settings.
         options: Names of options that differ from the names of their settings.
+        positional: Settings that are arguments without an option.
     """
     import msgspec
 
     from gigabrain_zenoh.config.loading import expected
+    from gigabrain_zenoh.config.name_words import plain
 
     try:
         return msgspec.convert(values, type)
     except msgspec.ValidationError as error:
-        text, _, path = str(error).partition(" - at `$.")
-        name = path.rstrip("`")
+        text = plain(error)
+        place, _, reason = text.partition(": ")
         fields = {field.name: field.type for field in msgspec.structs.fields(type)}
-        if name in fields:
-            text = f"expected {expected(fields[name])}, got {values[name]}"
-        elif text.partition(": ")[0] in fields:  # the type refuses the value of this field
-            name, _, text = text.partition(": ")
-        option = "--" + UNIT.sub("", (options or {}).get(name, name)).replace("_", "-")
-        raise ConfigError(f"{option}: {text}" if name else text) from None
+        name = re.split(r"[.\[]", place)[0]
+        if name not in fields:
+            raise ConfigError(text) from None
+        if str(error).endswith(f" - at `$.{name}`"):
+            reason = f"expected {expected(fields[name])}, got {_short(values[name])}"
+        option = (options or {}).get(name, UNIT.sub("", name))
+        shown = name.upper() if name in positional else f"--{option.replace('_', '-')}"
+        raise ConfigError(f"{shown}: {reason}") from None
+
+
+def check_name(argument: str, name: str, most_chars: int = MAX_NAME_CHARS) -> None:
+    """Raise ConfigError for a name that is empty or too long."""
+    if not 1 <= len(name) <= most_chars:
+        raise ConfigError(
+            f"{argument}: expected a name of 1 to {most_chars} characters, got {_short(name)!r}"
+        )
+
+
+def _short(value: object) -> str:
+    """Return a value as text; a long one ends with dots."""
+    text = str(value)
+    return text if len(text) <= MAX_SHOWN_CHARS else f"{text[:MAX_SHOWN_CHARS]}..."
 
 
 def check_positive(**options: float | None) -> None:

@@ -9,7 +9,7 @@ from cyclopts import Parameter
 from msgspec import structs
 
 from gigabrain_zenoh.bus.zenoh.config import router_config, secured, session_config
-from gigabrain_zenoh.cli.options import Level, Seed, World, checked, print_progress
+from gigabrain_zenoh.cli.options import Level, Seed, World, check_names, checked, print_progress
 from gigabrain_zenoh.config.settings import (
     ButtonConfig,
     DecisionConfig,
@@ -250,6 +250,8 @@ def driver(
         "state_dir": _state_folder(state_dir, process.namespace or Path(name).stem),
     }
     settings = checked(values, DriverConfig)
+    if link != "real":
+        check_names(worlds=[world])
     load_link(
         name, Run(folder=Path(), link=link, cameras=cameras)
     )  # raises for a wrong name, before connecting

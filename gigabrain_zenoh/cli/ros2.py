@@ -26,6 +26,7 @@ from gigabrain_zenoh.runtime.running import find_endpoint
 
 if TYPE_CHECKING:
     from gigabrain_zenoh.gateway.topic_list import TopicRow
+    from gigabrain_zenoh.ros2.types import Types
 
 RENAMED = {"namespace": "ros_namespace"}  # option by setting, where they differ
 
@@ -86,8 +87,12 @@ def ros2(*, options: RosOptions = LOCAL_ROS, at: RobotAddress = LOCAL) -> int:
     If it ends, the robot's other processes keep running. In a deployment
     file, a part `ros2:` starts it with the robot.
     """
+    from gigabrain_zenoh.ros2.opening import load_types
+
+    wanted = checked(options.given(), Ros2Config, RENAMED)
+    load_types(wanted)  # raises for a wrong file, before connecting
     endpoint = _endpoint(at)
-    config = gateway_config(checked(options.given(), Ros2Config, RENAMED), endpoint)
+    config = gateway_config(wanted, endpoint)
     settings = msgspec.to_builtins(config)
     return run_process(ProcessConfig(name="ros2", endpoint=endpoint, settings=settings))
 
@@ -110,10 +115,13 @@ def topics(
     Args:
         all_topics: Also list the topics that every node has, and the parts of actions.
     """
+    from gigabrain_zenoh.ros2.opening import load_types
+
     link = checked(options.given(), Ros2Link, RENAMED)
+    types = load_types(link)
     if link.transport == "rmw_zenoh" and not link.router:
         link = with_ros_router(link, _endpoint(at))
-    listed = run_async(_listed(link, all_topics=all_topics))
+    listed = run_async(_listed(link, types, all_topics=all_topics))
     if json:
         for row in listed:
             print_json(row)
@@ -127,14 +135,14 @@ def topics(
         print_progress(f"the gateway's node {gateway_node(link)} is not among them")
 
 
-async def _listed(link: Ros2Link, *, all_topics: bool) -> "list[TopicRow]":
+async def _listed(link: Ros2Link, types: "Types", *, all_topics: bool) -> "list[TopicRow]":
     """Join ROS for a while, and list its topics. Raises BusError if there is no other node."""
     from gigabrain_zenoh.gateway.topic_list import rows
     from gigabrain_zenoh.ros2.graph import discovered, unreached
-    from gigabrain_zenoh.ros2.opening import ROUTER_S, load_types, open_transport
+    from gigabrain_zenoh.ros2.opening import ROUTER_S, open_transport
 
     own = msgspec.structs.replace(link, node=f"{link.node}_topics", namespace="/")
-    async with open_transport(own, load_types(own), timeout_s=ROUTER_S) as ros:
+    async with open_transport(own, types, timeout_s=ROUTER_S) as ros:
         found = await discovered(ros.endpoints)
     if not found:
         do = unreached(link.transport, link.domain, link.router)

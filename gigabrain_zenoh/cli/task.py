@@ -62,9 +62,12 @@ def goto(
         object: Class of a thing: go to the nearest one. If none is known, look for one.
         tag: Number of an AprilTag: go to a place in front of it.
     """
+    from gigabrain_zenoh.client.tasks import check_goal, check_object, check_place
+
     if object or tag is not None:
         if place or (object and tag is not None):
             raise ConfigError("goto: expected a place, --object or --tag; got more than one")
+        check_object(object, tag)
         send(at, lambda tasks: tasks.go_to_object(object, tag=tag, how=mode), wait)
         return
     if not place:
@@ -72,11 +75,13 @@ def goto(
     if y is None:
         if _is_number(place):
             raise ConfigError(f"goto: Y is missing: expected two numbers, or a name; got {place!r}")
+        check_place(place)
         send(at, lambda tasks: tasks.go_to_place(place, how=mode), wait)
         return
     if not _is_number(place):
         raise ConfigError(f"goto: expected two numbers, or the name of a place; got {place!r}")
     x = float(place)
+    check_goal(x, y, yaw)
     send(at, lambda tasks: tasks.go_to(x, y, yaw, how=mode), wait)
 
 
@@ -173,7 +178,7 @@ def cancel(task: TaskNameOrAll = "", /, *, at: RobotAddress = LOCAL) -> None:
 
     Example: gigabrain task cancel goal-7
     """
-    _with_tasks(at, lambda tasks: _print_reply(tasks.cancel(task)))
+    _change(at, task, lambda tasks: tasks.cancel(task))
 
 
 def pause(task: TaskName = "", /, *, at: RobotAddress = LOCAL) -> None:
@@ -181,7 +186,7 @@ def pause(task: TaskName = "", /, *, at: RobotAddress = LOCAL) -> None:
 
     Example: gigabrain task pause
     """
-    _with_tasks(at, lambda tasks: _print_reply(tasks.pause(task)))
+    _change(at, task, lambda tasks: tasks.pause(task))
 
 
 def resume(task: TaskName = "", /, *, at: RobotAddress = LOCAL) -> None:
@@ -189,11 +194,17 @@ def resume(task: TaskName = "", /, *, at: RobotAddress = LOCAL) -> None:
 
     Example: gigabrain task resume
     """
-    _with_tasks(at, lambda tasks: _print_reply(tasks.resume(task)))
+    _change(at, task, lambda tasks: tasks.resume(task))
 
 
-async def _print_reply(reply: Awaitable[str]) -> None:
-    print_line(await reply)
+def _change(at: RobotAddress, task: str, request: "Callable[[Tasks], Awaitable[str]]") -> None:
+    from gigabrain_zenoh.client.tasks import check_task
+
+    async def ask(tasks: "Tasks") -> None:
+        print_line(await request(tasks))
+
+    check_task(task)
+    _with_tasks(at, ask)
 
 
 def _with_tasks(at: RobotAddress, do: "Callable[[Tasks], Awaitable[None]]") -> None:

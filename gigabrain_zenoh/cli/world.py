@@ -4,9 +4,10 @@ from typing import Annotated, Literal
 
 from cyclopts import Parameter
 
-from gigabrain_zenoh.cli.options import LOCAL, RobotAddress, checked, on_bus, print_line
+from gigabrain_zenoh.cli.options import LOCAL, RobotAddress, check_name, checked, on_bus, print_line
 from gigabrain_zenoh.host.this_process import user_name
 
+MAX_NAME_CHARS = 32  # of an object
 TYPE_CHECKING = False
 if TYPE_CHECKING:
     from gigabrain_schemas.sim import SimReply, SimRequest, Thing
@@ -49,7 +50,8 @@ def add(
     }  # fmt: skip
     values |= {"size": size} if size else {}
     values |= {"name": name} if name else {}
-    request = SimRequest(do="add", thing=checked(values, Thing), source=user_name())
+    thing = checked(values, Thing, {"path": "to"}, positional=("kind", "x", "y"))
+    request = SimRequest(do="add", thing=thing, source=user_name())
     print_line(_ask(request, at).text)
 
 
@@ -63,8 +65,8 @@ def remove(name: str, /, *, at: RobotAddress = LOCAL) -> None:
     """
     from gigabrain_schemas.sim import SimRequest
 
-    fields = {"do": "remove", "name": name, "source": user_name()}
-    print_line(_ask(checked(fields, SimRequest), at).text)
+    check_name("NAME", name, MAX_NAME_CHARS)
+    print_line(_ask(SimRequest(do="remove", name=name, source=user_name()), at).text)
 
 
 def list_(*, at: RobotAddress = LOCAL) -> None:

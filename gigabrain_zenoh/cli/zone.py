@@ -1,11 +1,18 @@
 """`gigabrain place` and `gigabrain zone`: named places and zones of the robot's map."""
 
-import re
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from cyclopts import Parameter
+from msgspec import structs
 
-from gigabrain_zenoh.cli.options import LOCAL, RobotAddress, on_bus, print_line
+from gigabrain_zenoh.cli.options import (
+    LOCAL,
+    RobotAddress,
+    check_name,
+    checked,
+    on_bus,
+    print_line,
+)
 from gigabrain_zenoh.errors import BodyLost, ConfigError, Refused
 
 if TYPE_CHECKING:
@@ -55,12 +62,17 @@ def add(
         yaw: Heading on arrival [rad]. Default: any.
         replace: Replace a place or zone of the same name.
     """
+    from gigabrain_schemas.zones import Place
+
     if x is not None and y is None:
         raise ConfigError("a place takes x and y; expected both numbers, or none")
 
+    values = {"name": name, "x": x or 0.0, "y": y or 0.0, "yaw": yaw}
+    place = checked(values, Place, positional=values)
+
     async def change(bus: "Bus") -> str:
-        place = {"x": x, "y": y, "yaw": yaw} if x is not None else await _here(bus)
-        return await _ask(bus, {"place": {"name": name, **place}, "replace": replace})
+        found = place if x is not None else structs.replace(place, **await _here(bus))
+        return await _ask(bus, place=found, replace=replace)
 
     print_line(on_bus(at, change))
 
@@ -73,7 +85,8 @@ def remove(name: str, /, *, at: RobotAddress = LOCAL) -> None:
     Args:
         name: Name of the place or zone.
     """
-    print_line(on_bus(at, lambda bus: _ask(bus, {"remove": name})))
+    check_name("NAME", name)
+    print_line(on_bus(at, lambda bus: _ask(bus, remove=name)))
 
 
 def add_zone(
@@ -99,20 +112,23 @@ def add_zone(
         width: Width of a lane [m].
         replace: Replace a zone or place of the same name.
     """
+    from gigabrain_schemas.zones import Zone
+
     if len(points) % 2:
         raise ConfigError(f"{len(points)} numbers; expected pairs x y")
     if kind == "speed" and max_speed is None:
         raise ConfigError("a speed zone needs a limit; add --max-speed [m/s]")
     if kind == "one_way" and width is None:
         raise ConfigError("a lane needs a width; add --width [m]")
-    zone = {
+    values = {
         "name": name,
         "kind": kind,
         "points": list(zip(points[::2], points[1::2], strict=True)),
         "max_speed": max_speed,
         "lane_width": width,
     }
-    print_line(on_bus(at, lambda bus: _ask(bus, {"zone": zone, "replace": replace})))
+    zone = checked(values, Zone, {"lane_width": "width"}, positional=("name", "points"))
+    print_line(on_bus(at, lambda bus: _ask(bus, zone=zone, replace=replace)))
 
 
 async def _zones(bus: "Bus") -> "Zones":
@@ -146,18 +162,10 @@ async def _here(bus: "Bus") -> dict[str, Any]:
     return {"x": pose.x, "y": pose.y, "yaw": pose.yaw}
 
 
-async def _ask(bus: "Bus", fields: dict[str, Any]) -> str:
-    """Request a change; return the reply as text. Raises ConfigError, BodyLost and Refused."""
-    import msgspec
-
+async def _ask(bus: "Bus", **fields: Any) -> str:
+    """Request a change; return the reply as text. Raises BodyLost and Refused."""
     from gigabrain_schemas.zones import ZonesRequest
     from gigabrain_zenoh.client.zones import change_zones
-    from gigabrain_zenoh.config.name_words import plain
     from gigabrain_zenoh.host.this_process import user_name
 
-    try:
-        request = msgspec.convert({**fields, "source": user_name()}, ZonesRequest)
-    except (ValueError, OverflowError) as error:  # msgspec.ValidationError is one
-        text = re.sub(r"^(zone|place)(\.|: )", "", plain(error))
-        raise ConfigError(f"not a valid place or zone: {text}") from None
-    return await change_zones(bus, request)
+    return await change_zones(bus, ZonesRequest(**fields, source=user_name()))

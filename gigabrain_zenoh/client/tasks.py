@@ -49,6 +49,34 @@ def late(timeout_s: float) -> str:
     )
 
 
+def check_goal(x: float, y: float, yaw: float | None = None) -> None:
+    """Raise ConfigError for numbers that no goal in a map can have."""
+    given = (x, y) if yaw is None else (x, y, yaw)
+    if not all(abs(value) <= MAX_COORDINATE for value in given):
+        numbers = " ".join(f"{value:g}" for value in given)
+        raise ConfigError(f"a goal takes numbers up to {MAX_COORDINATE:g}, got {numbers}")
+
+
+def check_place(name: str) -> None:
+    """Raise ConfigError for a name that no place can have."""
+    if not 1 <= len(name) <= MAX_NAME_CHARS:
+        raise ConfigError(f"a place has a name of 1 to {MAX_NAME_CHARS} characters")
+
+
+def check_object(label: str = "", tag: int | None = None) -> None:
+    """Raise ConfigError for a class that no thing, or a number that no tag can have."""
+    if tag is not None and not 0 <= tag <= MAX_TAG:
+        raise ConfigError(f"a tag has a number from 0 to {MAX_TAG}, got {tag}")
+    if tag is None and not 1 <= len(label) <= MAX_NAME_CHARS:
+        raise ConfigError(f"a thing has a class of 1 to {MAX_NAME_CHARS} characters")
+
+
+def check_task(name: str) -> None:
+    """Raise ConfigError for a name that no task can have; empty is the current task."""
+    if len(name) > MAX_NAME_CHARS:
+        raise ConfigError(f"a task has a name of at most {MAX_NAME_CHARS} characters")
+
+
 class Tasks:
     """Client for the tasks of one robot."""
 
@@ -87,18 +115,14 @@ class Tasks:
 
         Raises ConfigError for numbers that are not valid, and Refused.
         """
-        given = (x, y) if yaw is None else (x, y, yaw)
-        if not all(abs(value) <= MAX_COORDINATE for value in given):
-            numbers = " ".join(f"{value:g}" for value in given)
-            raise ConfigError(f"a goal takes numbers up to {MAX_COORDINATE:g}, got {numbers}")
+        check_goal(x, y, yaw)
         return await self._go(GoalRequest(x=x, y=y, yaw=yaw, how=how, source=self._bus.process))
 
     async def go_to_place(
         self, name: str, yaw: float | None = None, *, how: How = "replace"
     ) -> str:
         """Send the robot to a named place of its map; return the task's name. Raises Refused."""
-        if not name or len(name) > MAX_NAME_CHARS:
-            raise ConfigError(f"a place has a name of 1 to {MAX_NAME_CHARS} characters")
+        check_place(name)
         request = GoalRequest(place=name, yaw=yaw, how=how, source=self._bus.process)
         return await self._go(request)
 
@@ -109,10 +133,7 @@ class Tasks:
 
         Returns the task's name. Raises ConfigError for an invalid name or number, and Refused.
         """
-        if tag is not None and not 0 <= tag <= MAX_TAG:
-            raise ConfigError(f"a tag has a number from 0 to {MAX_TAG}, got {tag}")
-        if tag is None and not 1 <= len(label) <= MAX_NAME_CHARS:
-            raise ConfigError(f"a thing has a class of 1 to {MAX_NAME_CHARS} characters")
+        check_object(label, tag)
         request = GoalRequest(object=label, tag=tag, how=how, source=self._bus.process)
         return await self._go(request)
 
@@ -270,6 +291,7 @@ class Tasks:
             raise self._no_server() from None
 
     async def _change(self, request: TaskRequest) -> str:
+        check_task(request.task)
         reply = await self._ask(TASK_CHANGE, request, ANSWER_S)
         if not reply.ok:
             raise Refused(reply.text)

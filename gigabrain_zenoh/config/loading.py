@@ -27,7 +27,7 @@ from gigabrain_zenoh.config.type_members import (
     structs_in,
 )
 from gigabrain_zenoh.config.yaml_text import Entry, Node
-from gigabrain_zenoh.errors import ConfigError, listed
+from gigabrain_zenoh.errors import MAX_UNKNOWN_CHARS, ConfigError, listed
 from gigabrain_zenoh.host.files import expanded, read_bounded
 from gigabrain_zenoh.host.network import host_shown
 
@@ -245,7 +245,7 @@ def _in_struct(
     fields = {f.encode_name: f for f in msgspec.structs.fields(type_)}
     config = type_.__struct_config__
     known = sorted([*fields, config.tag_field] if config.tag is not None else fields)
-    among = listed(known)
+    among = listed(known, MAX_UNKNOWN_CHARS)
     for entry in entries:
         if field := fields.get(entry.key):
             if fault := _find(entry.node, field.type, _join(path, entry.key), entry.line):

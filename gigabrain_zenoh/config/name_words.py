@@ -14,6 +14,15 @@ NAME_WORDS = {
     r"^\w+(/\w+)*$": "such as robot/cmd_vel",
     r"^\d{1,6}$": "of 1 to 6 digits",
 }
+TYPE_WORDS = {
+    "`int`": "a whole number",
+    "`float`": "a number",
+    "`str`": "a string",
+    "`bool`": "true or false",
+    "`null`": "null",
+    "`array`": "a list",
+    "`object`": "a mapping",
+}
 _QUOTED = {repr(pattern): words for pattern, words in NAME_WORDS.items()}
 
 
@@ -29,6 +38,6 @@ def plain(error: Exception) -> str:
     if found and found[1] in _QUOTED:
         text = f"Expected a string {_QUOTED[found[1]]}"
     if text.startswith("Expected "):
-        text = f"e{text[1:]}"
+        text = re.sub("`[a-z]+`", lambda kind: TYPE_WORDS.get(kind[0], kind[0]), f"e{text[1:]}")
     field = path.rstrip("`").removeprefix(".")
     return f"{field}: {text}" if field else text

@@ -76,6 +76,17 @@ def topic_pattern(name: str, live_keys: Iterable[str] = ()) -> TopicPattern | No
     return TopicPattern(key, topic_of(key)) if key in live_keys else None
 
 
+def check_topic(name: str) -> None:
+    """Raise UnknownName for a name that no topic of any robot can have, as that of a service."""
+    possible = short_name(name) not in COMMAND_OF_SERVICE
+    try:
+        check_key_expression(PREFIX + short_name(name))
+    except ConfigError:
+        possible = False
+    if not possible:
+        raise unknown_topic(name, ())
+
+
 def unknown_topic(name: str, live_keys: Iterable[str]) -> UnknownName:
     """Return the error for an unknown topic; it suggests the nearest topic, or a command."""
     if command := COMMAND_OF_SERVICE.get(short_name(name)):

@@ -15,6 +15,7 @@ from gigabrain_schemas.requests import Description
 from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.diagnostics.discovery import (
     TopicPattern,
+    check_topic,
     discover,
     topic_pattern,
     unknown_topic,
@@ -70,8 +71,10 @@ async def open_topic(
     where: Where, name: str, *, looks_on: bool = False
 ) -> AsyncIterator[tuple[Bus, TopicPattern]]:
     """Connect, and find the topic `name`. Raises BusError and ConfigError."""
+    found = topic_pattern(name)
+    if found is None:
+        check_topic(name)
     async with connect(where, CLIENT_NAME, looks_on=looks_on) as bus:
-        found = topic_pattern(name)
         if found is None:
             live_keys = (await snapshot(bus, widest_pattern(where))).live_keys
             found = topic_pattern(name, live_keys)

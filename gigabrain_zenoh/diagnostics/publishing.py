@@ -13,6 +13,7 @@ from gigabrain_schemas.topics import CMD_VEL, Topic
 from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.client.connection import connect
 from gigabrain_zenoh.client.robot import Robot
+from gigabrain_zenoh.config.name_words import plain
 from gigabrain_zenoh.diagnostics.discovery import PREFIX, short_name, unknown_topic
 from gigabrain_zenoh.errors import ConfigError, Refused, unknown
 from gigabrain_zenoh.gate.gate import BRAIN
@@ -44,7 +45,7 @@ def parse_message(topic: Topic[M], words: Sequence[str]) -> M:
     try:
         return msgspec.convert(values, topic.type)
     except msgspec.ValidationError as error:
-        raise ConfigError(f"not a valid {topic.type.__name__}: {error}") from None
+        raise ConfigError(f"not a valid {topic.type.__name__}: {plain(error)}") from None
 
 
 def _tree(words: Sequence[str]) -> dict[str, Any]:

@@ -162,6 +162,17 @@ def check_result_path(path: Path | None) -> None:
         raise ConfigError(f"cannot write {path}: {error.strerror}") from None
 
 
+def check_new_file(path: Path) -> None:
+    """Raise ConfigError where no new file `path`, with its folders, can be created."""
+    if os.path.lexists(path):
+        raise ConfigError(f"{path} exists; choose another file")
+    folder = next(each for each in path.absolute().parents if os.path.lexists(each))
+    if not os.path.isdir(folder):
+        raise ConfigError(f"cannot write {path}: {folder} is not a folder")
+    if not os.access(folder, os.W_OK | os.X_OK):
+        raise ConfigError(f"cannot write {path}: you may not write to {folder}")
+
+
 def check_picture_path(path: Path | None) -> None:
     """Raise ConfigError if no PNG can be written to `path`, or its suffix is not `.png`."""
     check_result_path(path)

@@ -17,6 +17,7 @@ from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.bus.key_expressions import key_expressions, matches
 from gigabrain_zenoh.config.settings import RecorderConfig
 from gigabrain_zenoh.host.escaping import printable
+from gigabrain_zenoh.host.files import check_new_file
 from gigabrain_zenoh.host.run_folders import state_dir
 from gigabrain_zenoh.host.signals import stop_signals
 from gigabrain_zenoh.recording.recorder import Recorder, Status, unused_path
@@ -129,7 +130,8 @@ async def _count(bus: Bus, recorder: Recorder) -> None:
 async def record(config: RecorderConfig, where: Where, seconds: float | None) -> int:
     """Record until Ctrl-C or for `seconds`; return the exit code. Raises GigabrainError."""
     path = recording_path(config)
-    key_expressions(config.topics)  # raises before a file is created
+    key_expressions(config.topics)  # raises before connecting
+    check_new_file(path)
     async with connect(where, "record", looks_on=True) as bus:
         recorder = Recorder(path, config)
         recorder.begin()

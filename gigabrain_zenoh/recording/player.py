@@ -151,6 +151,7 @@ async def check_no_driver(bus: Bus) -> None:
 async def play(path: Path, options: PlayOptions, where: Where, *, beside_robot: bool) -> int:
     """Play to the end or until Ctrl-C; return the exit code. Raises GigabrainError."""
     check_magic(path)
+    key_filter(options.topics)  # raises for a wrong name, before connecting
     async with connect(where, "play") as bus:
         if not beside_robot:
             await check_no_driver(bus)

@@ -148,11 +148,11 @@ def find_endpoint(connect: str | None, namespace: str = "", keys: str = "") -> E
     identity = str(expanded(keys).absolute()) if keys else ""
     if connect:
         return secured(Endpoint(connect=(connect,), namespace=namespace, keys=identity))
+    if identity and not os.path.isdir(identity):
+        check_files(Path(identity))  # reports a mistyped path, also where no keys are needed
     endpoint = find_running(namespace).endpoint
     if identity and endpoint.connect[-1].startswith(SECURE):
         return structs.replace(endpoint, connect=endpoint.connect[-1:], keys=identity)
-    if identity and not os.path.isdir(identity):
-        check_files(Path(identity))  # not used here, but report a mistyped path
     return endpoint
 
 

@@ -20,7 +20,7 @@ def test_a_network_of_ros_that_is_named_needs_no_robot(
 ) -> None:
     joined: list[Ros2Link] = []
 
-    async def listed(link: Ros2Link, *, all_topics: bool) -> list[object]:
+    async def listed(link: Ros2Link, _types: object, *, all_topics: bool) -> list[object]:
         joined.append(link)
         return []
 

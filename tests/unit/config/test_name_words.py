@@ -50,7 +50,7 @@ def test_each_pattern_of_messages_and_settings_has_words_and_no_other() -> None:
             "zone.name: expected a string of letters, digits, spaces, - _ and ., "
             "a letter or digit first",
         ),
-        ({"remove": 3}, "remove: expected `str`, got `int`"),
+        ({"remove": 3}, "remove: expected a string, got a whole number"),
         ({}, "expected one of zone, place and remove"),
     ],
 )

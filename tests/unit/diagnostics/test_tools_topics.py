@@ -246,9 +246,9 @@ def test_parts_lists_and_texts_can_be_typed() -> None:
     [
         (["liner_x=1"], "no field of CmdVel 'liner_x'; did you mean 'linear_x'?"),
         (["linear_x"], "'linear_x': expected field=value, or one JSON object"),
-        (["linear_x=fast"], "Expected `float`, got `str`"),
-        (["linear_x=nan"], "Expected `float`, got `str`"),
-        (["linear_x=1e30"], "Expected `float` <= 100.0"),
+        (["linear_x=fast"], "linear_x: expected a number, got a string"),
+        (["linear_x=nan"], "linear_x: expected a number, got a string"),
+        (["linear_x=1e30"], "linear_x: expected a number <= 100.0"),
         (["{linear_x: 1}"], "not JSON"),
         ([], "missing required field `linear_x`"),
         (["linear_x=1", "linear_x.a=2"], "'linear_x.a=2': linear_x already has a value"),

@@ -54,14 +54,15 @@ def test_a_robot_is_found_for_as_long_as_its_supervisor_says(notes: Path) -> Non
 
 
 def test_a_client_that_names_its_identity_does_not_get_the_rights_of_the_local_socket(
-    notes: Path,
+    tmp_path: Path, notes: Path
 ) -> None:
     """`release --keys home/viewer` on the robot's own host must be refused as elsewhere."""
+    viewer = str(tmp_path)
     ways = ("unixsock-stream//run/1.sock", "tls/127.0.0.1:7467")
     with announced("waffle", Endpoint(connect=ways, namespace="red")):
-        as_viewer = find_endpoint(None, keys="/home/viewer")
+        as_viewer = find_endpoint(None, keys=viewer)
         assert find_endpoint(None).connect == ways
-    expected = Endpoint(connect=ways[1:], namespace="red", keys="/home/viewer")
+    expected = Endpoint(connect=ways[1:], namespace="red", keys=viewer)
     assert as_viewer == expected
 
 

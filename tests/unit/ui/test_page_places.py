@@ -135,18 +135,18 @@ TRIANGLE = [[0, 0], [1, 0], [1, 1]]
                     "zone": {"name": "z", "kind": "speed", "points": TRIANGLE, "max_speed": 0}
                 },
             },
-            "zones.zone.max_speed: expected `float` >= 0.05",
+            "zones.zone.max_speed: expected a number >= 0.05",
         ),
         (
             {
                 "what": "zones",
                 "zones": {"zone": {"name": "z", "kind": "keepout", "points": [[0, 0]] * 300}},
             },
-            "zones.zone.points: expected `array` of length <= 256",
+            "zones.zone.points: expected a list of length <= 256",
         ),
         (
             {"what": "set", "process": "driver", "name": "speed_limit", "value": "1" * 501},
-            "value: expected `str` of length <= 500",
+            "value: expected a string of length <= 500",
         ),
     ],
     ids=["name", "speed", "corners", "setting"],
