@@ -244,11 +244,11 @@ def _open_standard_streams() -> None:
 
 def _report_full_disk(error: Exception) -> bool:
     """Print a message if the disk of the output is full; return False for any other `error`."""
-    from gigabrain_zenoh.host.files import FULL
+    from gigabrain_zenoh.host.files import FULL, file_problem
 
     if not isinstance(error, OSError) or error.errno not in FULL:
         return False
-    print(f"gigabrain: cannot write: {error.strerror}; free some space", file=sys.stderr)
+    print(f"gigabrain: cannot write: {file_problem(error)}", file=sys.stderr)
     return True
 
 

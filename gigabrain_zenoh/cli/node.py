@@ -21,7 +21,12 @@ from gigabrain_zenoh.cli.options import (
     print_table,
 )
 from gigabrain_zenoh.errors import BodyLost, ConfigError, Refused, unknown
-from gigabrain_zenoh.host.files import check_picture_path, check_result_path, replace_file
+from gigabrain_zenoh.host.files import (
+    cannot_write,
+    check_picture_path,
+    check_result_path,
+    replace_file,
+)
 
 if TYPE_CHECKING:
     from gigabrain_schemas.requests import ParamReply
@@ -247,7 +252,7 @@ def save_params(file: Path, /, *, at: RobotAddress = LOCAL) -> None:
     try:
         replace_file(file, with_values(file, changed).encode())
     except OSError as error:
-        raise ConfigError(f"cannot write {file}: {error.strerror}") from None
+        raise cannot_write(file, error) from None
     print_line(f"saved {', '.join(sorted(changed))} in {file}")
 
 

@@ -18,7 +18,7 @@ from gigabrain_zenoh.cli.options import (
     print_line,
     print_table,
 )
-from gigabrain_zenoh.errors import ConfigError
+from gigabrain_zenoh.host.files import cannot_write
 from gigabrain_zenoh.host.signals import run_async
 
 if TYPE_CHECKING:
@@ -199,5 +199,5 @@ def export(folder: Path) -> None:
     try:
         written = write(folder)
     except OSError as error:
-        raise ConfigError(f"cannot write {folder}: {error.strerror}") from None
+        raise cannot_write(folder, error) from None
     print(f"{len(written)} files in {folder}")

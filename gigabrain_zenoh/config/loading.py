@@ -28,7 +28,7 @@ from gigabrain_zenoh.config.type_members import (
 )
 from gigabrain_zenoh.config.yaml_text import Entry, Node
 from gigabrain_zenoh.errors import MAX_UNKNOWN_CHARS, ConfigError, listed
-from gigabrain_zenoh.host.files import expanded, read_bounded
+from gigabrain_zenoh.host.files import cannot_read, expanded, read_bounded
 from gigabrain_zenoh.host.network import host_shown
 
 _MAX_SHOWN_CHARS = 60  # of a value in an error
@@ -328,7 +328,7 @@ def read(path: Path) -> str:
     except FileNotFoundError:
         raise ConfigError(f"{path}: no such file{_nearest(path)}") from None
     except OSError as error:
-        raise ConfigError(f"{path}: cannot be read: {error.strerror}") from None
+        raise cannot_read(path, error) from None
     except UnicodeDecodeError as error:
         line = data.count(b"\n", 0, error.start) + 1
         byte = data[error.start]

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from gigabrain_schemas.base import Finite, Fraction
 from gigabrain_zenoh.config import loading as config
 from gigabrain_zenoh.errors import ConfigError
-from gigabrain_zenoh.host.files import read_bounded
+from gigabrain_zenoh.host.files import file_problem, read_bounded
 
 MAX_PIXELS, MAX_SIDE = 8_000_000, 100_000  # limits of a message [pixels]
 MAX_COORDINATE_M = 100_000.0  # limit of a message
@@ -51,7 +51,7 @@ def read_pgm(file: Path) -> NDArray[np.uint8]:
     try:
         data = read_bounded(file, MAX_PIXELS + MAX_HEADER_BYTES)
     except OSError as error:
-        raise ConfigError(f"{file}: the map's image: {error.strerror}") from None
+        raise ConfigError(f"{file}: the map's image: {file_problem(error)}") from None
     header = PGM_HEADER.match(data)
     if header is None:
         raise ConfigError(f"{file}: no binary PGM; expected a header such as 'P5 640 480 255'")

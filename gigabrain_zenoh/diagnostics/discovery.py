@@ -21,6 +21,7 @@ from gigabrain_zenoh.bus.listening import topic_of
 from gigabrain_zenoh.diagnostics.robot_view import ProcessHealth
 from gigabrain_zenoh.errors import BodyLost, ConfigError, UnknownName, unknown
 from gigabrain_zenoh.host.escaping import printable
+from gigabrain_zenoh.host.files import cannot_write
 
 PREFIX = "robot/"
 COMMAND_OF_SERVICE = {  # services that users mistake for topics, and their commands
@@ -236,7 +237,7 @@ def write_graph_png(flows: Iterable[Flow], path: Path) -> None:
     try:
         figure.savefig(path, dpi=120, format="png")
     except OSError as error:
-        raise ConfigError(f"cannot write {path}: {error.strerror}") from None
+        raise cannot_write(path, error) from None
 
 
 def _text(axes: Any, place: tuple[float, float], text: str, size: int, box: dict[str, Any]) -> None:

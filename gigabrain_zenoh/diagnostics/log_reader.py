@@ -18,7 +18,7 @@ from gigabrain_zenoh.codec import DECODE_ERRORS
 from gigabrain_zenoh.diagnostics.discovery import discover
 from gigabrain_zenoh.diagnostics.listener import stop_on_broken_pipe
 from gigabrain_zenoh.errors import ConfigError, unknown
-from gigabrain_zenoh.host.files import open_regular
+from gigabrain_zenoh.host.files import cannot_read, open_regular
 from gigabrain_zenoh.host.run_folders import past_runs, state_dir
 from gigabrain_zenoh.host.signals import stop_signals
 from gigabrain_zenoh.logs import FILE_BYTES, LEVELS, is_time
@@ -95,7 +95,7 @@ def read(folder: Path, wanted: LogFilter, newest: int) -> list[Line]:
             newest, enumerate(lines), key=lambda each: (each[1]["t"], each[0])
         )
     except OSError as error:
-        raise ConfigError(f"cannot read {error.filename}: {error.strerror}") from None
+        raise cannot_read(error.filename, error) from None
     return [line for _, line in reversed(numbered)]
 
 

@@ -136,13 +136,39 @@ def sync_folder(path: Path) -> None:
 
 
 FULL = (errno.ENOSPC, errno.EDQUOT)
+PROBLEMS = {  # by errno: what is wrong, and what to do
+    errno.EACCES: ("no permission", "change its rights, or choose another place"),
+    errno.EEXIST: ("that name is taken", "choose another"),
+    errno.EISDIR: ("it is a folder", "name a file"),
+    errno.ELOOP: ("its symbolic links lead in a circle", "name the file itself"),
+    errno.ENAMETOOLONG: ("the name is too long", "choose a shorter one"),
+    errno.ENOENT: ("no such file or folder", "check the path"),
+    errno.ENOTDIR: ("a part of the path is a file, not a folder", "check the path"),
+    errno.EPERM: ("no permission", "change its rights, or choose another place"),
+    errno.EROFS: ("the disk is read-only", "choose another place"),
+    **dict.fromkeys(FULL, ("the disk is full", "free some space")),
+}
 
 
-def unwritable(folder: str | Path, error: OSError, remedy: str) -> ConfigError:
-    """Return the error for a folder that cannot be written: DiskFull if it only lacks space."""
-    full = error.errno in FULL
-    text = f"cannot write {folder}: {error.strerror}; {'free some space' if full else remedy}"
-    return DiskFull(text) if full else ConfigError(text)
+def file_problem(error: OSError, remedy: str = "") -> str:
+    """Return the cause of a file's error and what to do; `remedy` replaces the usual advice.
+
+    A full disk always needs space.
+    """
+    code = error.errno or 0
+    cause, advice = PROBLEMS.get(code, (error.strerror or str(error), "choose another file"))
+    return f"{cause}; {advice if code in FULL else remedy or advice}"
+
+
+def cannot_write(path: str | Path, error: OSError, remedy: str = "") -> ConfigError:
+    """Return the error for a file or folder that cannot be written: DiskFull if it lacks space."""
+    kind = DiskFull if error.errno in FULL else ConfigError
+    return kind(f"cannot write {path}: {file_problem(error, remedy)}")
+
+
+def cannot_read(path: str | Path, error: OSError) -> ConfigError:
+    """Return the error for a file or folder that cannot be read."""
+    return ConfigError(f"cannot read {path}: {file_problem(error)}")
 
 
 def check_result_path(path: Path | None) -> None:
@@ -150,16 +176,16 @@ def check_result_path(path: Path | None) -> None:
     if path is None:
         return
     if not os.path.isdir(path.parent):
-        raise ConfigError(f"cannot write {path}: no such folder")
+        raise ConfigError(f"cannot write {path}: no such folder; create it first")
     if os.path.isdir(path):
-        raise ConfigError(f"cannot write {path}: it is a folder")
+        raise ConfigError(f"cannot write {path}: it is a folder; name a file")
     if os.path.exists(path):  # do not open it: the reader of a FIFO would see its end
         return
     try:
         path.touch()
         os.unlink(os.path.realpath(path))  # of a dangling link remove the new file, not the link
     except OSError as error:
-        raise ConfigError(f"cannot write {path}: {error.strerror}") from None
+        raise cannot_write(path, error) from None
 
 
 def check_new_file(path: Path) -> None:
@@ -168,9 +194,11 @@ def check_new_file(path: Path) -> None:
         raise ConfigError(f"{path} exists; choose another file")
     folder = next(each for each in path.absolute().parents if os.path.lexists(each))
     if not os.path.isdir(folder):
-        raise ConfigError(f"cannot write {path}: {folder} is not a folder")
+        raise ConfigError(f"cannot write {path}: {folder} is not a folder; choose another path")
     if not os.access(folder, os.W_OK | os.X_OK):
-        raise ConfigError(f"cannot write {path}: you may not write to {folder}")
+        raise ConfigError(
+            f"cannot write {path}: you may not write to {folder}; choose another folder"
+        )
 
 
 def check_picture_path(path: Path | None) -> None:
@@ -187,4 +215,4 @@ def write_result(results: object, path: Path | None) -> None:
     try:
         path.write_bytes(msgspec.json.format(msgspec.json.encode(results)) + b"\n")
     except OSError as error:
-        raise ConfigError(f"cannot write {path}: {error.strerror}") from None
+        raise cannot_write(path, error) from None

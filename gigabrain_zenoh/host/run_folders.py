@@ -12,7 +12,7 @@ from pathlib import Path
 from urllib.parse import quote
 
 from gigabrain_zenoh.errors import ConfigError
-from gigabrain_zenoh.host.files import make_folder, unwritable
+from gigabrain_zenoh.host.files import cannot_write, make_folder
 from gigabrain_zenoh.host.posix import fcntl
 
 log = logging.getLogger(__name__)
@@ -125,7 +125,7 @@ def state_locked(folder: Path, label: str, host: str) -> Iterator[None]:
                 "stop it, or give this one a `namespace` of its own"
             ) from None
         except OSError as error:
-            raise unwritable(folder, error, REMEDY) from None
+            raise cannot_write(folder, error, REMEDY) from None
         yield
 
 
@@ -164,4 +164,4 @@ def state_dir() -> Path:
 
 def unwritable_runs(folder: Path, error: OSError) -> ConfigError:
     """Return the error for a run folder that cannot be written."""
-    return unwritable(f"the run folder {folder}", error, REMEDY)
+    return cannot_write(f"the run folder {folder}", error, REMEDY)

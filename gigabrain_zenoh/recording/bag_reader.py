@@ -29,7 +29,7 @@ from gigabrain_schemas.topics import DEPTH, IMAGE, current_key
 from gigabrain_zenoh.bus.headers import Header, SequenceGaps, header_of
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.host.escaping import printable
-from gigabrain_zenoh.host.files import open_regular
+from gigabrain_zenoh.host.files import cannot_read, open_regular
 
 log = logging.getLogger(__name__)
 
@@ -147,7 +147,7 @@ def check_magic(path: Path) -> None:
         with open_regular(path) as file:
             head = file.read(len(MAGIC))
     except OSError as error:
-        raise ConfigError(f"cannot read {path}: {error.strerror}") from None
+        raise cannot_read(path, error) from None
     if not head:
         raise ConfigError(f"{path} is empty")
     if head[:5] == MAGIC[:5] and head[6:] == MAGIC[6:] and head != MAGIC:

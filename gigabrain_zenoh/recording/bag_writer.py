@@ -20,6 +20,7 @@ from gigabrain_zenoh.bus.headers import Header, is_json
 from gigabrain_zenoh.bus.listening import topic_of
 from gigabrain_zenoh.codec import Codec, encoding_of
 from gigabrain_zenoh.errors import ConfigError
+from gigabrain_zenoh.host.files import cannot_write
 from gigabrain_zenoh.host.posix import fcntl
 from gigabrain_zenoh.recording.bag_reader import RAW
 from gigabrain_zenoh.recording.drawing import Drawer
@@ -66,7 +67,7 @@ class AppendOnlyFile:
         except FileExistsError as error:
             raise ConfigError(f"{error.filename} exists; choose another file") from None
         except OSError as error:
-            raise ConfigError(f"cannot write {path}: {error.strerror}") from None
+            raise cannot_write(path, error) from None
         fcntl.flock(self._fd, fcntl.LOCK_EX | fcntl.LOCK_NB)  # recovery then skips this file
 
     def write(self, data: bytes) -> int:
@@ -139,7 +140,7 @@ class BagWriter:
         except OSError as error:
             self._file.close()
             path.unlink(missing_ok=True)
-            raise ConfigError(f"cannot write {path}: {error.strerror}") from None
+            raise cannot_write(path, error) from None
         self._viewers, self._drawer = viewers, Drawer()
         self._decoders = {t.type: Codec(t.type, t.max_bytes).decode for t in TOPICS}
         self._schemas: dict[str, int] = {}

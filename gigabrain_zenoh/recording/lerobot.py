@@ -25,6 +25,7 @@ from gigabrain_schemas.topics import BODY
 from gigabrain_schemas.topics import STATE as STATE_TOPIC
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.geometry.pose import velocity_of
+from gigabrain_zenoh.host.files import cannot_write
 from gigabrain_zenoh.recording.bag_reader import Bag, samples
 from gigabrain_zenoh.recording.lerobot_video import VIDEO_PATH, VideoFeature, write_videos
 from gigabrain_zenoh.recording.message_tables import message_of
@@ -264,7 +265,7 @@ def _new_folder(folder: Path) -> Iterator[None]:
         if created:
             shutil.rmtree(folder, ignore_errors=True)
         if isinstance(error, OSError):
-            raise ConfigError(f"cannot write {folder}: {error.strerror or error}") from None
+            raise cannot_write(folder, error) from None
         raise
 
 

@@ -16,7 +16,7 @@ from gigabrain_schemas.sensors import LaserScan
 from gigabrain_schemas.topics import TOPICS
 from gigabrain_zenoh.codec import Codec
 from gigabrain_zenoh.errors import ConfigError, unknown
-from gigabrain_zenoh.host.files import check_picture_path, replacing
+from gigabrain_zenoh.host.files import cannot_write, check_picture_path, replacing
 from gigabrain_zenoh.recording.bag_reader import Bag, Sample, samples
 
 Value = float | int | str | bool | None
@@ -81,7 +81,7 @@ def write_csv(path: Path, folder: Path) -> list[Path]:
             }
             _write_rows(islice(Bag(path), count), writers)
     except OSError as error:
-        raise ConfigError(f"cannot write {folder}: {error.strerror}") from None
+        raise cannot_write(folder, error) from None
     return list(paths.values())
 
 
@@ -179,5 +179,5 @@ def plot(path: Path, fields: Sequence[str], to: Path) -> Path:
     try:
         figure.savefig(to, format="png", dpi=110)
     except OSError as error:
-        raise ConfigError(f"cannot write {to}: {error.strerror}") from None
+        raise cannot_write(to, error) from None
     return to

@@ -20,6 +20,7 @@ from gigabrain_zenoh.bus.zenoh.workarounds import LONGEST_S
 from gigabrain_zenoh.config.settings import RecorderConfig
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.host.bounded import put_newest
+from gigabrain_zenoh.host.files import file_problem
 from gigabrain_zenoh.logs import Fault
 from gigabrain_zenoh.recording.bag_reader import PICTURE_KEYS, PICTURES_NOTE
 from gigabrain_zenoh.recording.bag_writer import BagWriter, ReceivedMessage
@@ -303,7 +304,7 @@ class Recorder:
         try:
             file.add(message)
         except OSError as error:
-            self._abandon(file, f"cannot write {file.path}: {error.strerror}")
+            self._abandon(file, f"cannot write {file.path}: {file_problem(error)}")
             return
         if self._is_full(file, message):
             self._finish()
@@ -331,7 +332,7 @@ class Recorder:
                 self._finish()
                 self._report(self._low_text())
         except OSError as error:
-            self._abandon(file, f"cannot write {file.path}: {error.strerror}")
+            self._abandon(file, f"cannot write {file.path}: {file_problem(error)}")
 
     def _finish(self) -> None:
         """Finish the current file with its index; if that fails, recovery can repair it later."""
@@ -345,7 +346,7 @@ class Recorder:
             file.add_notes("gigabrain.recorded", {name: str(getattr(now, name)) for name in names})
             file.finish()
         except OSError as error:
-            self._abandon(file, f"cannot finish {file.path}: {error.strerror}")
+            self._abandon(file, f"cannot finish {file.path}: {file_problem(error)}")
         else:
             self._close(file)
 
@@ -390,7 +391,7 @@ class Recorder:
             file.repeat(earlier, message.log_ns)
             low = self._disk_is_low(file)
         except OSError as error:
-            self._abandon(file, f"cannot write {file.path}: {error.strerror}")
+            self._abandon(file, f"cannot write {file.path}: {file_problem(error)}")
             return None
         if low:
             self._abandon(file, self._low_text())

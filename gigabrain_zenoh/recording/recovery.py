@@ -11,7 +11,7 @@ from mcap.writer import Writer
 from msgspec import Struct
 
 from gigabrain_zenoh.errors import ConfigError
-from gigabrain_zenoh.host.files import open_regular
+from gigabrain_zenoh.host.files import cannot_write, open_regular
 from gigabrain_zenoh.host.posix import fcntl
 from gigabrain_zenoh.recording.bag_reader import HEAD, MAGIC, Bag, BagDamage, check_magic
 from gigabrain_zenoh.recording.bag_writer import LIBRARY, PROFILE, VIEW, AppendOnlyFile
@@ -89,7 +89,7 @@ def recover(path: Path, to: Path) -> Recovered:
     except BaseException as error:
         to.unlink(missing_ok=True)
         if isinstance(error, OSError):
-            raise ConfigError(f"cannot write {to}: {error.strerror}") from None
+            raise cannot_write(to, error) from None
         raise
     finally:
         file.close()

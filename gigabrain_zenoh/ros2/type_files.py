@@ -12,6 +12,7 @@ from rosbags.typesys.base import TypesysError, create_field_desc
 from rosbags.typesys.msg import MSGParser
 
 from gigabrain_zenoh.errors import ConfigError
+from gigabrain_zenoh.host.files import cannot_read
 
 Description = tuple[Any, Any]  # rosbags' description of a type: (Nodetype, its parameters)
 Fields = list[tuple[str, Description]]
@@ -89,8 +90,10 @@ def _parts(file: Path) -> Iterator[tuple[str, str]]:
     kind = file.suffix[1:]
     try:
         text = file.read_text(encoding="utf-8-sig")
-    except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{file}: cannot be read: {error}") from None
+    except OSError as error:
+        raise cannot_read(file, error) from None
+    except UnicodeDecodeError:
+        raise ConfigError(f"{file}: expected UTF-8 text") from None
     texts: list[str] = [""]
     for line in text.splitlines():
         if line.split("#")[0].strip() == "---":

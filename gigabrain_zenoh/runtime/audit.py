@@ -20,9 +20,8 @@ import msgspec
 from gigabrain_schemas.logs import AuditPage, AuditRecord, AuditRequest, What
 from gigabrain_schemas.topics import AUDIT, AUDIT_LOG
 from gigabrain_zenoh.bus.bus import Bus
-from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.host.escaping import printable, printable_json
-from gigabrain_zenoh.host.files import read_bounded
+from gigabrain_zenoh.host.files import cannot_read, read_bounded
 from gigabrain_zenoh.host.threads import BackgroundWriter
 from gigabrain_zenoh.logs import Fault
 
@@ -98,7 +97,7 @@ def read_audit(folder: Path, count: int, process: str = "") -> tuple[AuditRecord
             try:
                 text = read_bounded(path, 2 * MAX_FILE_BYTES)
             except OSError as error:
-                raise ConfigError(f"cannot read {path}: {error.strerror}") from None
+                raise cannot_read(path, error) from None
             records = [*_records(text.splitlines()), *records]
             if len(records) >= count:
                 break

@@ -15,7 +15,7 @@ from gigabrain_zenoh.bus.zenoh.config import SECURE, secured
 from gigabrain_zenoh.codec import DECODE_ERRORS
 from gigabrain_zenoh.config.settings import Endpoint
 from gigabrain_zenoh.errors import Ambiguous, BusError, ConfigError, listed
-from gigabrain_zenoh.host.files import expanded, open_regular
+from gigabrain_zenoh.host.files import cannot_write, expanded, open_regular
 from gigabrain_zenoh.host.posix import fcntl
 from gigabrain_zenoh.security.identity_files import check_files
 
@@ -62,7 +62,7 @@ def announced(label: str, endpoint: Endpoint, run_dir: Path | None = None) -> It
         _check_private(note.parent)
         file = _write_locked(note, msgspec.json.encode(robot))
     except OSError as error:
-        raise ConfigError(f"cannot write {note}: {error.strerror}; set XDG_RUNTIME_DIR") from None
+        raise cannot_write(note, error, "set XDG_RUNTIME_DIR") from None
     with file:
         try:
             yield note

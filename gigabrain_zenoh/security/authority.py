@@ -22,7 +22,14 @@ from msgspec import Struct
 
 from gigabrain_schemas.topics import Role
 from gigabrain_zenoh.errors import ConfigError, NotYetValid
-from gigabrain_zenoh.host.files import read_bounded, replace_file, sync_folder, write_synced
+from gigabrain_zenoh.host.files import (
+    cannot_write,
+    file_problem,
+    read_bounded,
+    replace_file,
+    sync_folder,
+    write_synced,
+)
 from gigabrain_zenoh.host.network import host_and_port, is_host, is_ip
 from gigabrain_zenoh.security.acl import MAX_NAME_LENGTH, SERVERS, common_name, parse
 from gigabrain_zenoh.security.identity_files import (
@@ -204,7 +211,7 @@ def _new_folder(folder: Path) -> Iterator[Path]:
     except FileExistsError:
         raise exists from None
     except OSError as error:
-        raise ConfigError(f"cannot write {folder}: {error.strerror}") from None
+        raise cannot_write(folder, error) from None
 
 
 def _write(folder: Path, contents: Mapping[str, bytes]) -> None:
@@ -252,7 +259,7 @@ def write_list(folder: Path, generations: Mapping[str, int]) -> None:
     try:
         replace_file(folder / LIST, content)
     except OSError as error:
-        raise ConfigError(f"cannot write {folder / LIST}: {error.strerror}") from None
+        raise cannot_write(folder / LIST, error) from None
 
 
 EXPIRES_SOON_DAYS = 30
@@ -352,7 +359,7 @@ def _bytes(path: Path) -> bytes:
     except PermissionError:
         raise unreadable(path) from None
     except OSError as error:
-        raise ConfigError(f"{path}: {error.strerror}; {REMEDY}") from None
+        raise ConfigError(f"{path}: {file_problem(error, REMEDY)}") from None
 
 
 def _attribute(certificate: x509.Certificate, oid: x509.ObjectIdentifier) -> str:

@@ -13,8 +13,10 @@ from gigabrain_schemas.topics import Role
 from gigabrain_zenoh.config.settings import Endpoint
 from gigabrain_zenoh.errors import BusError, ConfigError
 from gigabrain_zenoh.host.files import (
+    cannot_read,
     create_file,
     expanded,
+    file_problem,
     open_regular,
     read_bounded,
     replace_file,
@@ -80,7 +82,7 @@ def made_once(path: Path, content: bytes) -> tuple[bytes, bool]:
                 replace_file(path, content, 0o600)
             return found or content, not found
     except OSError as error:
-        raise ConfigError(f"cannot read or write {path}: {error.strerror}") from None
+        raise ConfigError(f"cannot read or write {path}: {file_problem(error)}") from None
 
 
 def unreadable(path: Path) -> ConfigError:
@@ -182,7 +184,7 @@ def generations_in(folder: Path) -> dict[str, int]:
     except FileNotFoundError:
         return {}
     except OSError as error:
-        raise ConfigError(f"{path}: {error.strerror}") from None
+        raise cannot_read(path, error) from None
     except (msgspec.DecodeError, UnicodeDecodeError) as error:
         raise ConfigError(f"{path}: {error}; copy it from the fleet's folder again") from None
 
@@ -201,8 +203,8 @@ def find_fleet(folder: Path | None) -> Path:
     try:
         places = (Path(), *sorted(Path().iterdir()))
     except OSError as error:
-        text = f"cannot list this folder: {error.strerror}; name the fleet's folder with --dir"
-        raise ConfigError(text) from None
+        remedy = "name the fleet's folder with --dir"
+        raise ConfigError(f"cannot list this folder: {file_problem(error, remedy)}") from None
     fleets = [place for place in places if os.path.exists(place / CA_KEY)]
     if not fleets:
         raise ConfigError("no fleet in this folder; create one with `gigabrain keys new`, "

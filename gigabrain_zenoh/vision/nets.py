@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from gigabrain_zenoh.config.settings import RecognizerConfig
 from gigabrain_zenoh.errors import ConfigError
-from gigabrain_zenoh.host.files import read_bounded
+from gigabrain_zenoh.host.files import file_problem, read_bounded
 from gigabrain_zenoh.vision.labels import CLASSES, COCO_IDS
 from gigabrain_zenoh.vision.onnx_file import input_of
 from gigabrain_zenoh.vision.recognizer import (
@@ -78,7 +78,7 @@ def read_labels(path: Path) -> tuple[str, ...]:
     try:
         text = read_bounded(path, MAX_LABEL_BYTES).decode("utf-8-sig")
     except OSError as error:
-        raise ConfigError(f"recognizer: labels: {path}: {error.strerror or error}") from None
+        raise ConfigError(f"recognizer: labels: {path}: {file_problem(error)}") from None
     except UnicodeDecodeError:
         raise ConfigError(f"recognizer: labels: {path}: expected UTF-8 text") from None
     lines = [line.strip() for line in text.rstrip().splitlines()]

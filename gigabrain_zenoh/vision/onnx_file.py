@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from gigabrain_zenoh.errors import ConfigError
-from gigabrain_zenoh.host.files import read_bounded
+from gigabrain_zenoh.host.files import file_problem, read_bounded
 
 MAX_BYTES = 1_000_000_000
 GRAPH, INITIALIZER, INPUT = 7, 5, 11  # fields of ModelProto and GraphProto
@@ -29,7 +29,7 @@ def input_of(path: Path) -> OnnxInput:
     try:
         data = memoryview(read_bounded(path, MAX_BYTES))
     except OSError as error:
-        raise ConfigError(f"{path}: {error.strerror or error}") from None
+        raise ConfigError(f"{path}: {file_problem(error)}") from None
     try:
         graphs = [value for number, value in _fields(data) if number == GRAPH]
         parts = list(_fields(_message(graphs[-1])))

@@ -143,7 +143,7 @@ def test_its_arm_has_the_kinematics_of_an_so101_on_its_top_plate() -> None:
     [
         ('model="so101" body', 'model="so102" body', "no model 'so102' in its assets"),
         ('body="base" prefix', 'body="bace" prefix', "no body 'bace' to attach"),
-        ("../so101", "../so102", "No such file"),
+        ("../so101", "../so102", "no such file"),
         ("</mujoco>", "", "no XML"),
         ('<body name="base">', '<body name="trunk">', "no body 'base' in the worldbody"),
     ],

@@ -86,7 +86,7 @@ def test_a_missing_model_file_is_named(tmp_path: Path) -> None:
     original = catalog.robot_path(WAFFLE).read_text()
     mine = tmp_path / "robot.yaml"
     mine.write_text(original)  # without its model.xml
-    with pytest.raises(ConfigError, match=r"model\.xml: No such file"):
+    with pytest.raises(ConfigError, match=r"model\.xml: no such file"):
         catalog.make_driver(str(mine), Run(folder=Path(), world="arena"))
 
 

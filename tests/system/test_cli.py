@@ -86,7 +86,7 @@ def test_an_output_to_a_full_disk_fails_in_one_line(words: str, unbuffered: str)
             text=True,
             check=False,
         )
-    assert command.stderr == "gigabrain: cannot write: No space left on device; free some space\n"
+    assert command.stderr == "gigabrain: cannot write: the disk is full; free some space\n"
     assert command.returncode == 1
 
 

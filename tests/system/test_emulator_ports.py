@@ -156,7 +156,7 @@ def test_a_folder_of_ports_can_be_used_by_one_emulator_only(tmp_path: Path) -> N
         pass
     (tmp_path / "file").touch()
     with (
-        pytest.raises(ConfigError, match="file: File exists; expected a folder"),
+        pytest.raises(ConfigError, match="file: that name is taken; choose another folder"),
         claimed(tmp_path / "file"),
     ):
         pass

@@ -103,7 +103,7 @@ def test_the_first_message_of_a_key_on_a_full_disk_counts_as_dropped(
         wait(recorder, lambda now: now.written == 1)
         monkeypatch.setattr(FullTape, "full", True)
         recorder.intake.receive("robot/scan", "", bags.scan(1))
-        wait(recorder, lambda now: "No space left on device" in now.fault)
+        wait(recorder, lambda now: "the disk is full" in now.fault)
         monkeypatch.setattr(FullTape, "full", False)
     assert (recorder.status().written, recorder.status().dropped) == (1, 1)
 
@@ -126,7 +126,7 @@ def test_after_a_full_disk_recording_goes_on_in_a_new_file(
         try:
             send(101, 100)
             wait(recorder, lambda now: now.written + now.dropped == 200)
-            wait(recorder, lambda now: "No space left on device" in now.fault)  # it keeps retrying
+            wait(recorder, lambda now: "the disk is full" in now.fault)  # it keeps retrying
         finally:
             FullTape.full = False
         time.sleep(0.05)

@@ -11,7 +11,7 @@ from xml.etree.ElementTree import Element
 
 from gigabrain_schemas.body import MAX_MODEL_CHARACTERS
 from gigabrain_zenoh.errors import ConfigError
-from gigabrain_zenoh.host.files import read_bounded
+from gigabrain_zenoh.host.files import file_problem, read_bounded
 
 DEFAULT_CLASS = "main"  # MuJoCo's name of defaults without a class
 NAME_ATTRIBUTES = (
@@ -101,7 +101,9 @@ def _section(root: Element, name: str) -> Element:
 def _read_text(path: Path) -> str:
     try:
         return read_bounded(path, MAX_MODEL_CHARACTERS).decode()
-    except (OSError, ValueError) as error:
+    except OSError as error:
+        raise ConfigError(f"{path}: the model of the arm: {file_problem(error)}") from None
+    except ValueError as error:
         raise ConfigError(f"{path}: the model of the arm: {error}") from None
 
 

@@ -28,7 +28,7 @@ from gigabrain_zenoh.gate import causes as why
 from gigabrain_zenoh.gate import gate
 from gigabrain_zenoh.gate.gate import GateState
 from gigabrain_zenoh.geometry.limits import Limits
-from gigabrain_zenoh.host.files import make_folder, read_bounded, replace_file, unwritable
+from gigabrain_zenoh.host.files import cannot_write, make_folder, read_bounded, replace_file
 from gigabrain_zenoh.host.threads import BackgroundWriter
 from gigabrain_zenoh.logs import Fault
 from gigabrain_zenoh.runtime.audit import AuditTrail
@@ -79,7 +79,7 @@ class LatchFile:
         except (ConfigError, *DECODE_ERRORS):
             found = Latched(causes=(UNREADABLE,))
         except OSError as error:
-            raise unwritable(self._folder, error, REMEDY) from None
+            raise cannot_write(self._folder, error, REMEDY) from None
         self.write(found)
         return found
 
@@ -98,7 +98,7 @@ class LatchFile:
         try:
             replace_file(self._path, msgspec.json.encode(latched))
         except OSError as error:
-            raise unwritable(self._folder, error, REMEDY) from None
+            raise cannot_write(self._folder, error, REMEDY) from None
         self._written = latched
 
 

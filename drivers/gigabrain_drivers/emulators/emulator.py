@@ -24,6 +24,7 @@ from gigabrain_drivers.sim.worlds import load_world
 from gigabrain_zenoh.clock import Clock
 from gigabrain_zenoh.config.loading import located
 from gigabrain_zenoh.errors import ConfigError
+from gigabrain_zenoh.host.files import cannot_write
 from gigabrain_zenoh.host.posix import fcntl
 from gigabrain_zenoh.plugins import load_plugin
 
@@ -74,7 +75,7 @@ def claimed(folder: Path) -> Iterator[None]:
                 f"another emulator uses {folder}; end it, or take another folder (--ports)"
             ) from None
         except OSError as error:
-            raise ports_error(folder, error) from None
+            raise cannot_write(folder, error, "choose another folder (--ports)") from None
         yield
 
 

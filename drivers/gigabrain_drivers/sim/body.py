@@ -25,7 +25,7 @@ from gigabrain_drivers.kinematics.wheels import (
 from gigabrain_schemas.base import NonNegative, Percentage, Positive
 from gigabrain_schemas.body import JointDescription
 from gigabrain_zenoh.errors import ConfigError, unknown
-from gigabrain_zenoh.host.files import read_bounded
+from gigabrain_zenoh.host.files import file_problem, read_bounded
 
 WHEELS = {  # the driven parts of a model, by drive type
     "differential": ("wheel_left", "wheel_right"),
@@ -240,10 +240,11 @@ def sim_body(robot: RobotFile, options: MujocoOptions, run: Run) -> SimModel:
     except UnicodeDecodeError:
         raise ConfigError(f"{path}: expected UTF-8 text") from None
     except OSError as error:
-        raise ConfigError(
-            f"{path}: {error.strerror}; the robot's MJCF model belongs there, "
-            "its own or that of a body like it; `model` names it"
-        ) from None
+        remedy = (
+            "the robot's MJCF model belongs there, its own or that of a body like it; "
+            "`model` names it"
+        )
+        raise ConfigError(f"{path}: {file_problem(error, remedy)}") from None
     lidar = _sim_lidar(robot, options)
     found: dict[str, Any] = {
         "model": model,

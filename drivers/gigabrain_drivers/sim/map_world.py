@@ -10,7 +10,7 @@ from gigabrain_drivers.sim.world import Box, World
 from gigabrain_zenoh.config import map_image
 from gigabrain_zenoh.config.map_image import MAX_PIXELS, SavedMap, read_pgm
 from gigabrain_zenoh.errors import ConfigError
-from gigabrain_zenoh.host.files import read_bounded
+from gigabrain_zenoh.host.files import file_problem, read_bounded
 
 MAX_BOXES = 4000
 MAX_PNG_BYTES = 16_000_000
@@ -99,7 +99,7 @@ def _read_image(file: Path) -> NDArray[np.uint8]:
     try:
         data = read_bounded(file, MAX_PNG_BYTES)
     except OSError as error:
-        raise ConfigError(f"{file}: the map's image: {error.strerror}") from None
+        raise ConfigError(f"{file}: the map's image: {file_problem(error)}") from None
     if not data.startswith(b"\x89PNG"):
         return read_pgm(file)
     from gigabrain_drivers.sim.png import read_png  # MuJoCo decodes it

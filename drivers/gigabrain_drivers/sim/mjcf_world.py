@@ -11,7 +11,7 @@ import numpy as np
 
 from gigabrain_drivers.sim.world import Box, Shape, World
 from gigabrain_zenoh.errors import ConfigError
-from gigabrain_zenoh.host.files import read_bounded
+from gigabrain_zenoh.host.files import file_problem, read_bounded
 
 MAX_MODEL_BYTES = 10_000_000
 MAX_GEOMS, MAX_BODIES, MAX_EXTENT_M = 10_000, 800, 400.0
@@ -39,7 +39,7 @@ def load_model(path: Path) -> mujoco.MjSpec:
             raise ConfigError(f"{path}: it repeats parts more than {MAX_GEOMS} times")
         return mujoco.MjSpec.from_file(str(path))
     except OSError as error:
-        raise ConfigError(f"{path}: the world's model: {error.strerror}") from None
+        raise ConfigError(f"{path}: the world's model: {file_problem(error)}") from None
     except ValueError as error:
         raise model_error(path, error) from None
 

@@ -18,7 +18,8 @@ from gigabrain_drivers.sim.physics import Simulation
 from gigabrain_drivers.sim.png import png
 from gigabrain_drivers.sim.world import Pose, World, clearance
 from gigabrain_drivers.sim.worlds import load_world
-from gigabrain_zenoh.errors import ConfigError, Unsupported
+from gigabrain_zenoh.errors import Unsupported
+from gigabrain_zenoh.host.files import cannot_write
 
 DISTANCE_M, HEIGHT_M = 1.0, 0.50  # of the camera: from the robot, and above the floor
 AIM_HEIGHT_M = 0.22  # aim above the robot, to have the room in the picture
@@ -66,7 +67,7 @@ def save_picture(
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_bytes(png(pixels.astype(np.uint8)))
     except OSError as error:
-        raise ConfigError(f"cannot write {path}: {error.strerror}") from None
+        raise cannot_write(path, error) from None
 
 
 def _light(model: mujoco.MjModel, robot: Pose) -> None:

@@ -12,7 +12,7 @@ from typing import cast
 from gigabrain_zenoh.decision.tasks.mission import Script
 from gigabrain_zenoh.errors import GigabrainError, Refused, unknown
 from gigabrain_zenoh.host import this_process
-from gigabrain_zenoh.host.files import expanded
+from gigabrain_zenoh.host.files import expanded, file_problem
 
 log = logging.getLogger(__name__)
 
@@ -100,7 +100,9 @@ class Run:
                 async with _leash(program.get_pid()):
                     result = await self._outcome(program, output, script.seconds)
             self.result = result
-        except (GigabrainError, OSError, ValueError) as error:
+        except OSError as error:
+            self.result = False, f"cannot be run: {file_problem(error)}"
+        except (GigabrainError, ValueError) as error:
             self.result = False, f"cannot be run: {error}"
 
     async def _outcome(

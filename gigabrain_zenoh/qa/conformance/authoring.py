@@ -23,6 +23,7 @@ from gigabrain_zenoh.clock import Clock
 from gigabrain_zenoh.config.settings import LinkName
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.geometry.limits import ZERO
+from gigabrain_zenoh.host.files import cannot_write
 from gigabrain_zenoh.qa.conformance.driver_checks import link_of
 
 PACKAGE_NAME = re.compile(r"[a-z][a-z0-9_]{0,62}[a-z0-9]")
@@ -66,7 +67,7 @@ def write_package(name: str, folder: Path) -> Path:
     except FileExistsError:
         raise ConfigError(f"{path} exists; nothing was written") from None
     except OSError as error:
-        raise ConfigError(f"cannot write {path}: {error.strerror}") from None
+        raise cannot_write(path, error) from None
     return path
 
 

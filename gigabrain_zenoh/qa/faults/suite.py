@@ -22,7 +22,7 @@ from msgspec import Struct
 from gigabrain_zenoh.config.renames import FAULT_NAMES, renamed_word
 from gigabrain_zenoh.errors import ConfigError, GigabrainError, unknown
 from gigabrain_zenoh.host import this_process
-from gigabrain_zenoh.host.files import read_bounded
+from gigabrain_zenoh.host.files import cannot_read, cannot_write, read_bounded
 from gigabrain_zenoh.qa.faults import rows as row_modules
 from gigabrain_zenoh.qa.faults.rig import Options, Rig
 from gigabrain_zenoh.qa.judging import (
@@ -237,12 +237,17 @@ class RunsFile:
             for line in map(_line.decode, text.splitlines()):
                 if line.options == self._options:
                     runs.setdefault(line.number, []).append(line.run)
-        except (OSError, msgspec.MsgspecError) as error:
+        except OSError as error:
+            raise cannot_read(self._path, error) from None
+        except msgspec.MsgspecError as error:
             raise ConfigError(f"cannot continue {self._path}: {error}") from None
         return dict(runs)
 
     def append(self, row: FaultRow, run: FaultRun) -> None:
-        """Append one run."""
+        """Append one run. Raises ConfigError."""
         line = RunLine(number=row.number, name=row.name, options=self._options, run=run)
-        with self._path.open("ab") as file:
-            file.write(msgspec.json.encode(line) + b"\n")
+        try:
+            with self._path.open("ab") as file:
+                file.write(msgspec.json.encode(line) + b"\n")
+        except OSError as error:
+            raise cannot_write(self._path, error) from None

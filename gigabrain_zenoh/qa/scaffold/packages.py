@@ -10,6 +10,7 @@ from typing import Literal
 
 from gigabrain_zenoh.decision import behaviours
 from gigabrain_zenoh.errors import ConfigError
+from gigabrain_zenoh.host.files import cannot_write
 from gigabrain_zenoh.launch.deployment import Deployment
 from gigabrain_zenoh.launch.processes import GROUP, PROCESSES
 from gigabrain_zenoh.perception import perceptors
@@ -76,7 +77,7 @@ def write_package(kind: Kind, name: str, folder: Path) -> Path:
     except FileExistsError:
         raise ConfigError(f"{path} exists; nothing was written") from None
     except OSError as error:
-        raise ConfigError(f"cannot write {path}: {error.strerror}") from None
+        raise cannot_write(path, error) from None
     return path
 
 

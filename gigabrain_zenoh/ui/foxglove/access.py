@@ -20,6 +20,7 @@ from pathlib import Path
 from gigabrain_zenoh.config.settings import FoxgloveConfig
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.host import this_process
+from gigabrain_zenoh.host.files import cannot_write
 from gigabrain_zenoh.host.run_folders import state_dir
 from gigabrain_zenoh.security.identity_files import made_once
 
@@ -192,4 +193,4 @@ def write_layout(config: FoxgloveConfig, path: Path) -> None:
             os.fchmod(file.fileno(), 0o600)
             file.write(layout.replace(TOPIC_PLACEHOLDER, topic_to_steer(config)))
     except OSError as error:
-        raise ConfigError(f"cannot write {path}: {error.strerror}") from None
+        raise cannot_write(path, error) from None

@@ -54,7 +54,7 @@ def check(config: PageConfig) -> None:
         )
     for file in filter(None, (config.certificate, config.certificate_key)):
         if not os.access(file, os.R_OK):
-            raise ConfigError(f"page: cannot read {file}")
+            raise ConfigError(f"page: cannot read {file}; check its path and its rights")
     if config.certificate:
         _check_certificate(config.certificate, config.certificate_key)
 

@@ -91,5 +91,5 @@ def test_the_reason_of_a_fault_test_is_printed_as_it_is(
 def test_an_error_is_one_line(capsys: pytest.CaptureFixture[str]) -> None:
     assert _call(["bag", "info", "missing\x1b[2J\n.mcap"]) == 2
     assert capsys.readouterr().err == (
-        "gigabrain: cannot read missing\\x1b[2J\\n.mcap: No such file or directory\n"
+        "gigabrain: cannot read missing\\x1b[2J\\n.mcap: no such file or folder; check the path\n"
     )

@@ -40,9 +40,9 @@ def test_a_file_that_cannot_be_written_is_named_before_anything_is_changed(
 ) -> None:
     close_folder(tmp_path / "closed", monkeypatch)
     for file, fault in (
-        (tmp_path / "none" / "x.yaml", "no such folder"),
-        (tmp_path / "closed" / "inner" / "x.yaml", "no such folder"),
-        (tmp_path, "it is a folder"),
+        (tmp_path / "none" / "x.yaml", "no such folder; create it first"),
+        (tmp_path / "closed" / "inner" / "x.yaml", "no such folder; create it first"),
+        (tmp_path, "it is a folder; name a file"),
     ):
         with pytest.raises(ConfigError) as error:
             node.set_param("decision", "stop_margin", "0.1", save=file)
@@ -105,6 +105,6 @@ def test_a_full_disk_leaves_the_file_as_it_was(
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(os, "fsync", fsync)
-    with pytest.raises(ConfigError, match=r"^cannot write .*slow.yaml: No space left on device$"):
+    with pytest.raises(ConfigError, match=r"^cannot write .*slow.yaml: the disk is full; free"):
         node.save_params(file)
     assert [path.read_text() for path in tmp_path.iterdir()] == ["robot: {max_linear_speed: 0.2}\n"]

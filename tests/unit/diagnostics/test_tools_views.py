@@ -79,7 +79,7 @@ def test_the_graph_is_drawn_as_text_for_graphviz_and_for_mermaid() -> None:
 def test_the_graph_is_drawn_into_a_picture(tmp_path: Path) -> None:
     write_graph_png(FLOWS, tmp_path / "graph.png")
     assert (tmp_path / "graph.png").read_bytes()[:4] == b"\x89PNG"
-    with pytest.raises(ConfigError, match="No such file"):
+    with pytest.raises(ConfigError, match="no such file"):
         write_graph_png(FLOWS, tmp_path / "nowhere" / "graph.png")
     assert list(graph_positions(["safety", "tool", "driver"])) == ["driver", "safety", "tool"]
 

@@ -18,7 +18,7 @@ from tests.unit.drivers.feetech import OPTIONS, ROBOT, Rig
 
 @pytest.mark.parametrize(
     ("name", "reason"),
-    [("file/so101.yaml", "Not a directory"), ("folder", "Is a directory")],
+    [("file/so101.yaml", "a part of the path is a file"), ("folder", "it is a folder")],
 )
 async def test_a_file_that_cannot_be_written_is_refused_before_an_arm_is_touched(
     tmp_path: Path, name: str, reason: str

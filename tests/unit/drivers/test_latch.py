@@ -43,7 +43,7 @@ def test_a_file_that_cannot_be_read_counts_as_latched(tmp_path: Path, content: b
 
 def test_a_folder_that_cannot_be_written_is_named(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
-    with pytest.raises(ConfigError, match=r"cannot write .*file/state: Not a directory"):
+    with pytest.raises(ConfigError, match=r"cannot write .*file/state: a part of the path"):
         LatchFile(tmp_path / "file" / "state").read()
 
 
@@ -58,7 +58,7 @@ def test_on_a_full_disk_what_was_latched_is_read_and_a_first_start_says_why(
 
     monkeypatch.setattr(gatekeeper, "replace_file", full)
     assert LatchFile(tmp_path).read() == was
-    with pytest.raises(DiskFull, match=r"cannot write .*new: No space left on device; [^\n]*$"):
+    with pytest.raises(DiskFull, match=r"cannot write .*new: the disk is full; [^\n]*$"):
         LatchFile(tmp_path / "new").read()
 
 
@@ -88,4 +88,4 @@ async def test_a_driver_that_cannot_keep_its_latch_waits_until_there_is_space(
     assert (folder / "latch.json").stat().st_size
     ((line, data),) = ((one.getMessage(), vars(one)["data"]) for one in caplog.records)
     assert data == {"event": "disk full"}  # by which a demo knows it
-    assert line.startswith(f"cannot write {folder}: No space left on device; free some space")
+    assert line.startswith(f"cannot write {folder}: the disk is full; free some space")

@@ -14,9 +14,15 @@ pytest.importorskip("mujoco")
 from gigabrain_drivers.sim import picture
 
 
-@pytest.mark.parametrize("number", ["ENOSPC", "EACCES"])
+@pytest.mark.parametrize(
+    ("number", "problem"),
+    [
+        ("ENOSPC", "the disk is full; free some space"),
+        ("EACCES", "no permission; change its rights, or choose another place"),
+    ],
+)
 def test_a_picture_that_cannot_be_written_is_named_in_one_line(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: str
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: str, problem: str
 ) -> None:
     def write(*_: object) -> int:
         raise OSError(code, os.strerror(code))
@@ -27,4 +33,4 @@ def test_a_picture_that_cannot_be_written_is_named_in_one_line(
     monkeypatch.setattr(Path, "write_bytes", write)
     with pytest.raises(ConfigError) as error:
         picture.portray("turtlebot3_waffle", "arena", 0, tmp_path / "x.png")
-    assert str(error.value) == f"cannot write {tmp_path / 'x.png'}: {os.strerror(code)}"
+    assert str(error.value) == f"cannot write {tmp_path / 'x.png'}: {problem}"

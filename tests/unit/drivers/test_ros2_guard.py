@@ -17,7 +17,7 @@ GOOD = "#!/bin/sh\necho 1\ncat > /dev/null\n"
 @pytest.mark.parametrize(
     ("program", "fault"),
     [
-        (None, "cannot be started: [Errno 2] No such file or directory"),
+        (None, "cannot be started: no such file or folder; check the path"),
         ("#!/bin/sh\necho hello\n", "printed something other than a number"),
         ("#!/bin/sh\nprintf '%070000d'\n", "printed something other than a number"),
         ("#!/bin/sh\n", "has ended"),

@@ -24,10 +24,10 @@ def test_a_path_that_can_be_written_is_left_as_it_was(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("name", "fault"),
     [
-        ("none/x", "no such folder"),
-        (".", "it is a folder"),
-        ("x" * 300, "File name too long"),
-        ("/proc/x.json", "No such file or directory"),
+        ("none/x", "no such folder; create it first"),
+        (".", "it is a folder; name a file"),
+        ("x" * 300, "the name is too long; choose a shorter one"),
+        ("/proc/x.json", "no such file or folder; check the path"),
     ],
 )
 def test_a_path_that_cannot_be_written_is_refused(tmp_path: Path, name: str, fault: str) -> None:

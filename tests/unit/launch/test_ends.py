@@ -171,7 +171,7 @@ def test_a_report_that_cannot_be_written_is_still_printed(
         rejected=0,
     )
     demo._options = replace(demo._options, report=tmp_path / "gone" / "report.json")
-    with pytest.raises(ConfigError, match=r"cannot write .*report\.json: No such file or dir"):
+    with pytest.raises(ConfigError, match=r"cannot write .*report\.json: no such file or folder"):
         demo._finish(make_report({}, seen), "", stopped=False)
     assert capsys.readouterr().out.startswith("ok: 700.00 m in 3600 s, 9 turns")
 
@@ -344,7 +344,7 @@ async def test_up_waits_while_its_disk_is_full(
     await up(DEPLOYMENT, "robot", lines.append)
     assert len(pauses) == 3
     assert lines[0].startswith("waiting for space on the disk: cannot write ")
-    assert lines[0].endswith(": No space left on device; free some space")
+    assert lines[0].endswith(": the disk is full; free some space")
     assert lines[1].startswith("turtlebot3_waffle on robot: ")
 
 

@@ -177,15 +177,13 @@ def test_a_second_setup_replaces_the_first_and_the_file_goes_on(
 
 def test_a_run_folder_that_cannot_be_written_is_refused_in_one_line(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
-    said = (
-        r"^cannot write the run folder .*/file/run: Not a directory; make it writable, or set .*$"
-    )
+    said = r"^cannot write the run folder .*/file/run: a part of the path is .*; make it writable"
     with pytest.raises(ConfigError, match=said):
         logs.setup("control", tmp_path / "file" / "run", json_console=True)
-    with pytest.raises(ConfigError, match="Not a directory"):
+    with pytest.raises(ConfigError, match="a part of the path is a file"):
         run_folders.new_run_dir(tmp_path / "file", "demo")
     (tmp_path / "control.jsonl").mkdir()
-    with pytest.raises(ConfigError, match="Is a directory"):
+    with pytest.raises(ConfigError, match="it is a folder"):
         logs.setup("control", tmp_path, json_console=True)
 
 

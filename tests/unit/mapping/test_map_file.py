@@ -138,7 +138,7 @@ def test_a_damaged_image_is_refused_in_one_line(damage: object, message: str, pa
         ("-2.35", "99995", "room.yaml: origin: the map reaches to (100001, 6) m"),
         ("1.1", "-100001", "room.yaml: origin: the map reaches to (4, -100001) m"),
         ("0.196", "0.7", "room.yaml: free_thresh must be below occupied_thresh"),
-        ("room.pgm", "gone.pgm", "gone.pgm: the map's image: No such file or directory"),
+        ("room.pgm", "gone.pgm", "gone.pgm: the map's image: no such file or folder"),
     ],
 )
 def test_a_wrong_description_is_refused_in_one_line(
@@ -257,7 +257,7 @@ def test_a_save_that_fails_half_way_keeps_the_old_map(
 
 def test_a_map_path_that_is_too_long_is_refused_in_one_line() -> None:
     for read in (map_file.load, map_file.load_graph):
-        with pytest.raises(ConfigError, match="File name too long"):
+        with pytest.raises(ConfigError, match=r"(?i)name (is )?too long"):
             read(Path("/" + "room" * 100 + ".yaml"))
 
 

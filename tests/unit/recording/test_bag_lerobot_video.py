@@ -141,11 +141,11 @@ def test_a_dataset_that_failed_can_be_converted_again(
             convert(path, folder)
     with monkeypatch.context() as full:
         full.setattr(lerobot, "write_videos", raising(OSError(28, "No space left on device")))
-        with pytest.raises(ConfigError, match=r"cannot write .*dataset: No space left on device"):
+        with pytest.raises(ConfigError, match=r"cannot write .*dataset: the disk is full"):
             convert(path, folder)
     assert not folder.exists()
     convert(path, folder)
-    with pytest.raises(ConfigError, match=r"cannot write .*dataset: File exists"):
+    with pytest.raises(ConfigError, match=r"cannot write .*dataset: that name is taken"):
         convert(path, folder)
     assert info_of(folder)["total_frames"] == 10
 

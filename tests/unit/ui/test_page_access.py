@@ -81,7 +81,7 @@ def test_tokens_are_read_from_a_folder_that_cannot_be_written(
     read_only = OSError(30, "Read-only file system")
     monkeypatch.setattr("tempfile.NamedTemporaryFile", lambda **_: (_ for _ in ()).throw(read_only))
     assert tokens(path) == (created, False)
-    with pytest.raises(ConfigError, match=r"other\.json: Read-only file system"):
+    with pytest.raises(ConfigError, match=r"other\.json: the disk is read-only"):
         tokens(tmp_path / "other.json")
 
 

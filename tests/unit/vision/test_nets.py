@@ -167,7 +167,7 @@ def test_a_missing_net_or_list_of_labels_is_named(tmp_path):
         load(tmp_path, "yolo", "cat")
     write_net(tmp_path / "my.onnx", SIZE, yolo())
     config = RecognizerConfig(onnx=str(tmp_path / "my.onnx"), labels="none.txt", layout="yolo")
-    with pytest.raises(ConfigError, match=r"none\.txt: No such file"):
+    with pytest.raises(ConfigError, match=r"none\.txt: no such file"):
         load_net(config)
 
 

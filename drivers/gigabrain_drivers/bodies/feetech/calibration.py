@@ -19,7 +19,7 @@ from gigabrain_drivers.bodies.feetech.protocol import MAX_ID, RADIANS_PER_TICK, 
 from gigabrain_schemas.body import JointDescription
 from gigabrain_zenoh.config import loading
 from gigabrain_zenoh.errors import ConfigError
-from gigabrain_zenoh.host.files import expanded, make_folder, replace_file
+from gigabrain_zenoh.host.files import cannot_write, expanded, make_folder, replace_file
 from gigabrain_zenoh.host.run_folders import state_dir
 
 Tick = Annotated[int, Meta(ge=0, le=TICKS - 1)]
@@ -113,7 +113,7 @@ def check_writable(path: Path) -> None:
         with tempfile.TemporaryFile(dir=path.parent) as draft:
             draft.write(bytes(CALIBRATION_BYTES))
     except OSError as error:
-        raise _unwritable(path, error) from None
+        raise cannot_write(path, error) from None
 
 
 def save_calibration(path: Path, calibration: Calibration) -> None:
@@ -123,11 +123,7 @@ def save_calibration(path: Path, calibration: Calibration) -> None:
         make_folder(path.parent)
         replace_file(path, text.encode())
     except OSError as error:
-        raise _unwritable(path, error) from None
-
-
-def _unwritable(path: Path, error: OSError) -> ConfigError:
-    return ConfigError(f"cannot write {path}: {error.strerror}")
+        raise cannot_write(path, error) from None
 
 
 class JointRange:

@@ -22,6 +22,7 @@ from gigabrain_drivers.bodies.ros2.options import Ros2Options
 from gigabrain_drivers.links.line_guard import AT_REST, MOVING, QUIT, GuardState
 from gigabrain_schemas.base import Velocity
 from gigabrain_zenoh.clock import Clock
+from gigabrain_zenoh.host.files import file_problem
 
 SILENCE_NS = 150_000_000  # zero is sent after this time without a report of a moving robot
 ZEROS_NS = 1_000_000_000  # zero is repeated for this time, because a message may get lost
@@ -108,7 +109,7 @@ class Guard:
         try:
             process = self._process = await self._start()
         except OSError as error:
-            return f"cannot be started: {error}"
+            return f"cannot be started: {file_problem(error)}"
         assert process.stdout
         assert process.stdin
         # time of the newest report that is no fault: the first one, one with readers, or any while
