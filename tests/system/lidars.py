@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from gigabrain_drivers.driver.robot import Run
 from gigabrain_drivers.emulators.base import Device, EmulatedBody
 from gigabrain_drivers.emulators.emulator import Station, emulated_body
+from gigabrain_drivers.emulators.ports import Pty
 from gigabrain_drivers.lidars.serial_source import SerialSource
 from gigabrain_schemas.body import Lidar
 from gigabrain_schemas.sensors import LaserScan
@@ -83,6 +84,22 @@ class Listener:
         start = len(self.scans)
         await until(lambda: len(self.scans) >= start + count)
         return self.scans[start : start + count]
+
+    async def next_scan_like(
+        self, expected: NDArray[np.float32], share: float, within: float = 0.06
+    ) -> None:
+        """Wait for a new scan that agrees with `expected`; a busy machine loses parts of others."""
+        seen = len(self.scans)
+        await until(
+            lambda: any(agreement(one, expected, within) > share for one in self.scans[seen:])
+        )
+
+
+def lost_bytes(station: Station) -> int:
+    """Return the count of bytes that this machine has read too late."""
+    port = station._port
+    assert isinstance(port, Pty)
+    return port.lost_bytes
 
 
 def agreement(scan: LaserScan, expected: NDArray[np.float32], within: float = 0.06) -> float:

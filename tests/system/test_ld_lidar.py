@@ -15,7 +15,17 @@ from gigabrain_drivers.lidars.ld.source import Ld19
 from gigabrain_schemas.body import Lidar
 from gigabrain_zenoh.clock import Clock, FakeClock
 from gigabrain_zenoh.testing.waiting import until
-from tests.system.lidars import LIDAR, Listener, Wire, agreement, emulated, run_for, truth, waffle
+from tests.system.lidars import (
+    LIDAR,
+    Listener,
+    Wire,
+    agreement,
+    emulated,
+    lost_bytes,
+    run_for,
+    truth,
+    waffle,
+)
 
 SMALL = Lidar(beams=8, rate_hz=10, range_min=0.1, range_max=3.0)
 MS = 1_000_000
@@ -120,18 +130,18 @@ async def test_scans_arrive_over_a_pty_and_again_after_it_was_unplugged(tmp_path
         emulated(LdDevice, options(tmp_path)) as station,
         Listener(Ld19(options(tmp_path), LIDAR, Clock())) as listener,
     ):
-        scan = (await listener.next_scans(3))[-1]
-        assert agreement(scan, truth()) > 0.97
-        assert listener.source.health.connected
-        assert listener.source.health.errors == 0
+        await listener.next_scan_like(truth(), 0.97)
+        await until(lambda: listener.source.health.connected)
+        if not lost_bytes(station):  # a host that stalls loses bytes of a UART
+            assert listener.source.health.errors == 0
 
         station.set(Faults(unplugged=True))
-        await until(lambda: listener.source.problem)
-        assert listener.source.problem == f"no {tmp_path}/scan: is it plugged in?"
+        missing = f"no {tmp_path}/scan: is it plugged in?"
+        await until(lambda: listener.source.problem == missing)
         assert not listener.source.health.connected
 
         station.set(NO_FAULTS)
-        await listener.next_scans(2)
+        await listener.next_scan_like(truth(), 0.97)
         assert listener.source.health.reconnects >= 1
         await until(lambda: not listener.source.problem)
 

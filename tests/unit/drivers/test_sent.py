@@ -1,4 +1,4 @@
-"""Commands sent to the body: the gate's output, rounded to the units of the body's protocol."""
+"""A driver sends its body the gate's output, rounded to the units of the body's protocol."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -26,7 +26,8 @@ ROUNDING = 1e-9
 BURGER = catalog.load_robot("turtlebot3_burger")
 
 
-def outputs(body: str) -> Iterator[Velocity]:
+def gate_outputs(body: str) -> Iterator[Velocity]:
+    """Return the gate's outputs for hostile commands, one a tick."""
     return (now for _, now in let_through(catalog.load_robot(body), COMMANDS))
 
 
@@ -40,72 +41,75 @@ def driver_of(body: str) -> Driver:
 
 @pytest.mark.long
 @pytest.mark.parametrize("body", BODIES)
-def test_the_drivers_own_clamp_changes_nothing_of_what_the_gate_lets_out(body: str) -> None:
+def test_a_driver_does_not_reduce_the_gates_output(body: str) -> None:
     driver = driver_of(body)
-    for now in outputs(body):
+    for now in gate_outputs(body):
         assert axes(driver.bounded(*axes(now))) == pytest.approx(axes(now), abs=ROUNDING)
 
 
 @pytest.mark.long
 @pytest.mark.parametrize("body", BODIES)
-def test_what_the_gate_lets_out_keeps_the_accelerations_straight_on_and_turning(body: str) -> None:
+def test_the_gates_output_keeps_linear_and_angular_acceleration_limits(body: str) -> None:
     robot = catalog.load_robot(body)
     worst = max(over(robot, before, now, 1) for before, now in let_through(robot, COMMANDS))
     assert worst < 1e-6
 
 
 @pytest.mark.long
-async def test_a_simulated_base_is_sent_just_that() -> None:
+async def test_a_simulated_base_is_sent_the_gates_output_unchanged() -> None:
     for body in ("turtlebot3_burger", "mycustombot", "alpha"):
         async with driver_of(body) as driver:
-            for now in outputs(body):
+            for now in gate_outputs(body):
                 sent = await driver.set_base_velocity(*axes(now))
                 assert axes(sent) == pytest.approx(axes(now), abs=ROUNDING)
 
 
 @pytest.mark.parametrize("body", ["turtlebot3_burger", "turtlebot3_waffle"])
-def test_an_opencr_is_sent_that_to_within_half_of_its_unit(body: str) -> None:
+def test_an_opencr_is_sent_the_gates_output_rounded_to_its_unit(body: str) -> None:
     base = wheels_of(catalog.load_robot(body))
     assert base
-    for now in outputs(body):
+    for now in gate_outputs(body):
         wheels = base.to_wheels(Twist(*axes(now)))
         assert max(map(abs, wheels)) <= opencr.MAX_WHEEL_SPEED  # or its driver would slow it down
         sent = opencr.velocity(now.linear_x, now.angular_z)
-        told = (sent.linear_x, sent.angular_z)
-        assert told == pytest.approx((now.linear_x, now.angular_z), abs=0.005 + ROUNDING)
+        assert (sent.linear_x, sent.angular_z) == pytest.approx(
+            (now.linear_x, now.angular_z), abs=0.005 + ROUNDING
+        )
 
 
-def test_a_line_base_is_sent_that_to_within_half_of_its_last_digit() -> None:
+def test_a_line_base_is_sent_the_gates_output_rounded_to_its_last_digit() -> None:
     command = LineCommand(Template("V,{linear_x:.3f},{angular_z:.3f}\n", COMMAND), None)
-    for now in outputs("mycustombot"):
+    for now in gate_outputs("mycustombot"):
         assert axes(command.sent(now)) == pytest.approx(axes(now), abs=0.0005 + ROUNDING)
 
 
-def test_a_quadruped_can_step_as_fast_as_the_gate_lets_it() -> None:
-    for now in outputs("alpha"):
+def test_a_quadruped_can_walk_at_every_velocity_of_the_gate() -> None:
+    for now in gate_outputs("alpha"):
         assert WALKER.to_body(WALKER.to_gait(Twist(*axes(now)))) == pytest.approx(axes(now))
 
 
-def told(*sent: Velocity) -> list[RobotState]:
-    """A robot's states while this was sent to its body, one a tick."""
+def states_with(*sent: Velocity) -> list[RobotState]:
+    """Return a robot's states of successive ticks, each with a velocity sent to its body."""
     return [
         replace(state(tick), gate=DRIVING, sent=velocity)
         for tick, velocity in enumerate(sent, start=1)
     ]
 
 
-def test_the_fault_suite_goes_by_what_was_sent_turning_included() -> None:
+def test_the_fault_suite_judges_changes_of_the_sent_velocity_in_turns_too() -> None:
     turning = Velocity(angular_z=2.6)
     within = Velocity(linear_x=0.02, angular_z=2.54)
     beyond = Velocity(linear_x=0.018, angular_z=2.366)  # what a clamp in the driver made of it
     fast = Velocity(linear_x=0.2)
-    gap = replace(told(fast)[0], tick=90)
-    assert commanded_over(BURGER, [*told(turning, within), gap]) == pytest.approx(0.0, abs=1e-6)
-    assert commanded_over(BURGER, [*told(turning, beyond), gap]) == pytest.approx(290.0)
-    shut = replace(told(beyond)[0], tick=2, gate=replace(DRIVING, mode="stopping"))
-    assert commanded_over(BURGER, [*told(turning), shut, gap, replace(gap, tick=91)]) == 0.0
+    gap = replace(states_with(fast)[0], tick=90)
+    assert commanded_over(BURGER, [*states_with(turning, within), gap]) == pytest.approx(
+        0.0, abs=1e-6
+    )
+    assert commanded_over(BURGER, [*states_with(turning, beyond), gap]) == pytest.approx(290.0)
+    shut = replace(states_with(beyond)[0], tick=2, gate=replace(DRIVING, mode="stopping"))
+    assert commanded_over(BURGER, [*states_with(turning), shut, gap, replace(gap, tick=91)]) == 0.0
 
 
-def test_the_fault_suite_judges_no_body_that_stood_still() -> None:
+def test_the_fault_suite_refuses_to_judge_a_run_without_turns() -> None:
     with pytest.raises(Failed, match=r"0.20 m/s and 0.00 rad/s at most"):
-        commanded_over(BURGER, told(Velocity(linear_x=0.2), Velocity(linear_x=0.2)))
+        commanded_over(BURGER, states_with(Velocity(linear_x=0.2), Velocity(linear_x=0.2)))
