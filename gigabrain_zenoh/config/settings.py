@@ -131,6 +131,7 @@ class EmulatorConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     world: str = "arena"
     seed: Seed = 0
     folder: str  # folder where its ports appear
+    checkpoint: str = ""  # path of its checkpoints in this run; empty: none
     cameras: bool = False  # send the emulated world as often as the cameras need it
     robot: dict[str, Any] = {}  # replaces fields of the body's file
 

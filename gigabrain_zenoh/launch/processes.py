@@ -116,6 +116,7 @@ def _emulator(deployment: "Deployment", place: ProcessPlace) -> EmulatorConfig:
         world=deployment.world,
         seed=deployment.seed,
         folder=str(place.ports),
+        checkpoint=str(place.checkpoint),
         cameras=deployment.cameras,
         robot=split(deployment.robot)[1],
     )

@@ -22,6 +22,7 @@ from gigabrain_drivers.kinematics.wheels import Twist, wheels_of
 from gigabrain_drivers.sim import STEP_S, Pace
 from gigabrain_drivers.sim.arm_truth import ArmTruth
 from gigabrain_drivers.sim.body import SimLidar
+from gigabrain_drivers.sim.checkpoint import PERIOD_NS, CheckpointFiles
 from gigabrain_drivers.sim.locomotion import Charge, Motor, OdometryReading
 from gigabrain_drivers.sim.physics import Simulation
 from gigabrain_drivers.sim.scene import ROBOT
@@ -63,8 +64,17 @@ class EmulatedBody:
     `command` sets the motors' targets. The devices stop the body when commands end.
     """
 
-    def __init__(self, robot: RobotFile, simulation: Simulation, run: Run) -> None:
+    def __init__(
+        self,
+        robot: RobotFile,
+        simulation: Simulation,
+        run: Run,
+        checkpoints: CheckpointFiles | None = None,
+    ) -> None:
         self.robot, self.run = robot, run
+        self._start_ns = simulation.time_ns
+        self._checkpoints = checkpoints
+        self._loop: asyncio.AbstractEventLoop | None = None  # after the start of time
         self.lost = ""  # why the physics ended; empty while it runs
         self.on_step: list[Callable[[Snapshot], None]] = []  # called in the physics thread
         self._simulation = simulation
@@ -88,6 +98,7 @@ class EmulatedBody:
 
     def start(self) -> None:
         """Start the physics."""
+        self._loop = asyncio.get_running_loop()
         self._thread = threading.Thread(target=self._work, name="physics", daemon=True)
         self._thread.start()
 
@@ -97,6 +108,8 @@ class EmulatedBody:
         thread, self._thread = self._thread, None
         if thread:
             await asyncio.to_thread(thread.join)
+        if self.lost and self._checkpoints:
+            await self._checkpoints.discard()  # it would fail again
 
     def command(self, linear_x: float, linear_y: float, angular_z: float) -> None:
         """Set the velocity that the motors aim for, from the next step on."""
@@ -151,10 +164,15 @@ class EmulatedBody:
         self._broken, self._faulted_ns = broken, self._simulation.time_ns
 
     @property
+    def resumed(self) -> bool:
+        """True if its run began in an earlier process: its electronics have lost their power."""
+        return self._start_ns > 0
+
+    @property
     def clock_ns(self) -> int:
-        """Time of the electronics' own clock; includes simulated time that the host dropped."""
+        """Time since power-on of the electronics; includes simulated time that the host dropped."""
         dropped_s = self._pace.dropped_s if self._pace else 0.0
-        return self._simulation.time_ns + round(dropped_s * 1e9)
+        return self._simulation.time_ns - self._start_ns + round(dropped_s * 1e9)
 
     @property
     def simulation(self) -> Simulation:
@@ -211,6 +229,9 @@ class EmulatedBody:
             self._untaken.append(snapshot)
         for callback in self.on_step:
             callback(snapshot)
+        if self._checkpoints and self._loop and self._simulation.time_ns % PERIOD_NS == 0:
+            checkpoint = self._simulation.checkpoint()
+            self._loop.call_soon_threadsafe(self._checkpoints.save, checkpoint)
 
     def _drive_arm(self) -> None:
         arm, aims = self._simulation.arm, self._aims

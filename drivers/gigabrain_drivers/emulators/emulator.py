@@ -19,7 +19,8 @@ from gigabrain_drivers.emulators.base import Broken, Device, EmulatedBody, Port,
 from gigabrain_drivers.emulators.faults import NO_FAULTS, Faults, FaultyWire, faults_in
 from gigabrain_drivers.emulators.ports import Pty, TcpPort
 from gigabrain_drivers.sim.body import MujocoOptions, SimBattery, sim_body
-from gigabrain_drivers.sim.physics import Simulation
+from gigabrain_drivers.sim.checkpoint import checkpoint_files
+from gigabrain_drivers.sim.physics import resumed
 from gigabrain_drivers.sim.worlds import load_world
 from gigabrain_zenoh.clock import Clock
 from gigabrain_zenoh.config.loading import located
@@ -34,7 +35,8 @@ BASE, SCAN = "base", "scan"
 def emulated_body(name: str, run: Run) -> EmulatedBody:
     """Return the robot called `name` in MuJoCo, from the `sim` part of its file.
 
-    Its battery has the voltages of its real link. Raises ConfigError.
+    Its battery has the voltages of its real link. It continues from the run's checkpoints, if
+    there are any. Raises ConfigError.
     """
     robot, _, options, folder = catalog.load_link(name, replace(run, link="sim"))
     if not isinstance(options, MujocoOptions):
@@ -47,8 +49,9 @@ def emulated_body(name: str, run: Run) -> EmulatedBody:
     _, _, real, _ = catalog.load_link(name, replace(run, link="emulated"))
     if volts := real.battery_volts():
         body = dataclasses.replace(body, battery=_charged(body.battery, *volts))
+    files = checkpoint_files(run)
     try:
-        return EmulatedBody(robot, Simulation(body, world, run.seed), run)
+        return EmulatedBody(robot, resumed(body, world, run.seed, files), run, files)
     except ConfigError as error:  # in the model that the file names
         raise located(catalog.robot_path(name), error) from None
 

@@ -114,6 +114,7 @@ def make_emulator(config: EmulatorConfig) -> Emulator:
             seed=config.seed,
             emulator=config.folder,
             cameras=config.cameras,
+            checkpoint=config.checkpoint,
             changes=config.robot,
         ),
     )

@@ -50,6 +50,12 @@ class Trot:
         self._phase = 0.0
         self.stepping = False  # False while all feet stay on the floor
 
+    def resume(self, joints: tuple[Vector, ...]) -> None:
+        """Stand at rest with these joint angles [rad]."""
+        legs = self._geometry.legs
+        self._feet = [leg.foot(its) for leg, its in zip(legs, joints, strict=True)]
+        self._height = -sum(z for _, _, z in self._feet) / len(self._feet)
+
     def sense(self, senses: Senses, passed_s: float) -> None:
         """Integrate a sample, `passed_s` after the last one."""
         self.odometry.update(senses, passed_s)

@@ -1,4 +1,4 @@
-"""Checkpoints of a simulation, so that a body keeps its place when its driver restarts."""
+"""Checkpoints of a simulation, so that a body keeps its place when its process restarts."""
 
 import asyncio
 import contextlib
@@ -12,6 +12,7 @@ from pathlib import Path
 import msgspec
 from msgspec import Struct
 
+from gigabrain_drivers.driver.robot import Run
 from gigabrain_schemas.sim import Thing
 from gigabrain_zenoh.codec import DECODE_ERRORS
 from gigabrain_zenoh.errors import ConfigError
@@ -19,6 +20,7 @@ from gigabrain_zenoh.errors import ConfigError
 log = logging.getLogger(__name__)
 
 HEADER = struct.Struct("<II")  # length of the content, and its CRC-32
+PERIOD_NS = 100_000_000  # of simulated time, between two checkpoints
 BINARY = getattr(os, "O_BINARY", 0)  # exists only on Windows
 
 
@@ -104,6 +106,11 @@ class CheckpointFiles:
         for path in self._paths:
             with contextlib.suppress(OSError):  # no such file, or the disk fails
                 path.unlink()
+
+
+def checkpoint_files(run: Run) -> CheckpointFiles | None:
+    """Return the checkpoints of a run; None if it keeps none."""
+    return CheckpointFiles(Path(run.checkpoint)) if run.checkpoint else None
 
 
 def _decoded(data: bytes) -> Checkpoint | None:

@@ -2,12 +2,10 @@
 
 import asyncio
 import contextlib
-import logging
 import math
 import threading
 import time
 from collections.abc import AsyncIterator, Callable, Mapping, Sequence
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 import numpy as np
@@ -17,7 +15,7 @@ from gigabrain_drivers.driver.base import Driver
 from gigabrain_drivers.driver.robot import RobotFile, Run
 from gigabrain_drivers.sim import STEP_NS, STEP_S, Pace
 from gigabrain_drivers.sim.body import MujocoOptions, sim_body
-from gigabrain_drivers.sim.checkpoint import Checkpoint, CheckpointFiles
+from gigabrain_drivers.sim.checkpoint import PERIOD_NS, Checkpoint, checkpoint_files
 from gigabrain_drivers.sim.worlds import load_world
 from gigabrain_schemas.arrays import ranges_bytes
 from gigabrain_schemas.base import TICK_NS, Message, Pose, Velocity
@@ -32,12 +30,11 @@ from gigabrain_zenoh.errors import BodyLost, ConfigError, Refused
 if TYPE_CHECKING:
     from gigabrain_drivers.sim.physics import Simulation
 
-log = logging.getLogger(__name__)
 
 T = TypeVar("T")
 STEPS_PER_TICK = TICK_NS // STEP_NS  # physics steps per tick of the robot's clock
 COMMAND_TIMEOUT_NS = 150_000_000  # simulated time after which the body stops, like a firmware
-CHECKPOINT_TICKS = 5  # 100 ms
+CHECKPOINT_TICKS = PERIOD_NS // TICK_NS
 SPEED_RANGE = (0.1, 100.0)
 
 
@@ -94,7 +91,7 @@ class MujocoDriver(Driver):
                 f"speed must be {SPEED_RANGE[0]:g} to {SPEED_RANGE[1]:g}, got {run.speed:g}"
             )
         self.lockstep = run.speed != 1.0
-        self._checkpoints = CheckpointFiles(Path(run.checkpoint)) if run.checkpoint else None
+        self._checkpoints = checkpoint_files(run)
         self._simulation = self._make_simulation()
         self._world = LiveWorld(self._simulation, run.world, robot.cameras)
         period_ns = 1e9 / robot.lidar.rate_hz if robot.lidar else math.inf
@@ -124,21 +121,11 @@ class MujocoDriver(Driver):
         return max(0, ticks) + CHECKPOINT_TICKS * (done_ns > 0)
 
     def _make_simulation(self) -> "Simulation":
-        """Resume at the checkpoint of an earlier driver of this run, or start the world."""
-        from gigabrain_drivers.sim.physics import Simulation  # imports MuJoCo, as above
+        from gigabrain_drivers.sim.physics import resumed  # imports MuJoCo, as above
 
         body = sim_body(self.robot, self.options, self.run)
         world, seed = load_world(self.run.world, self.run.seed), self.run.seed
-        if files := self._checkpoints:
-            try:
-                if checkpoint := files.read():
-                    simulation = Simulation(body, world, seed, checkpoint)
-                    log.info("the simulation continues at %.2f s", simulation.time_ns / 1e9)
-                    return simulation
-            except (ConfigError, OSError) as error:
-                log.warning("the simulation starts from the beginning: %s", error)
-                files.clear()
-        return Simulation(body, world, seed)
+        return resumed(body, world, seed, self._checkpoints)
 
     async def open(self) -> None:
         """Take the first readings. Time starts with the iteration of `ticks`."""

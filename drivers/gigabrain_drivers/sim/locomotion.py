@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import mujoco
 import numpy as np
+from numpy.typing import NDArray
 
 from gigabrain_drivers.kinematics.legs import JOINT_NAMES, LEGS, Gait, Senses, by_joint, by_leg
 from gigabrain_drivers.kinematics.trot import Trot
@@ -355,6 +356,14 @@ class Walking(Locomotion):
         self._trot = Trot(body.geometry, mass, stiffness, height)
         self._senses: Senses | None = None
         self._yaw = 0.0  # [rad], not wrapped
+
+    def resume(self, qpos: NDArray[np.float64]) -> None:
+        """Stand on the feet as they are, and rise from there."""
+        angles = qpos[self._angles].tolist()
+        self._data.qpos[self._angles] = self._data.ctrl[self._motors] = angles
+        self._counts = [round(angle / self._angle_per_tick) for angle in angles]
+        self._targets = by_leg(angles)
+        self._trot.resume(self._targets)
 
     @property
     def fallen(self) -> bool:  # type: ignore[override]

@@ -1,6 +1,7 @@
 """A body in a world, simulated in steps of 10 ms, without bus, clock or threads."""
 
 import hashlib
+import logging
 from dataclasses import replace
 from typing import Any
 
@@ -19,7 +20,7 @@ from gigabrain_drivers.sim.body import (
     SimModel,
     SimQuadruped,
 )
-from gigabrain_drivers.sim.checkpoint import Checkpoint
+from gigabrain_drivers.sim.checkpoint import Checkpoint, CheckpointFiles
 from gigabrain_drivers.sim.locomotion import (
     Battery,
     Charge,
@@ -37,6 +38,8 @@ from gigabrain_drivers.sim.things import Things
 from gigabrain_drivers.sim.truth import Truth
 from gigabrain_drivers.sim.world import Stream, World, generator
 from gigabrain_zenoh.errors import BodyLost, ConfigError, Unsupported
+
+log = logging.getLogger(__name__)
 
 GRAVITY = 9.81  # [m/s2]
 STALL_AMPERES = 1.4  # stall current of the usual motor
@@ -120,8 +123,10 @@ class Simulation:
         physics = np.frombuffer(checkpoint.physics)
         mujoco.mj_setState(self.model, self.data, physics, PHYSICS)
         self.data.qvel[:] = 0.0
-        self._steps = checkpoint.steps
+        self._steps, joints = checkpoint.steps, self.data.qpos.copy()
         self._locomotion = make_locomotion(body, self.model, self.data)
+        if isinstance(self._locomotion, Walking):  # wheels count from zero
+            self._locomotion.resume(joints)
         if self.arm:
             self.arm.restore(checkpoint.aims, limp=checkpoint.limp)
         self._battery.left_ah = checkpoint.charge_ah
@@ -131,6 +136,8 @@ class Simulation:
         self._past_stops = checkpoint.person_stood
         self._place_people()
         mujoco.mj_forward(self.model, self.data)
+        if self.truth.tipped:
+            raise ConfigError("the robot had fallen over")
         self.truth.restore(
             contacts=checkpoint.contacts,
             falls=checkpoint.falls,
@@ -275,6 +282,23 @@ class Simulation:
         diverged = any(warning.number for warning in self._warnings)
         if diverged or not (abs(x) < limit and abs(y) < limit and abs(z) < 1):
             raise BodyLost(f"the simulation diverged after {self.time_ns / 1e9:.2f} s")
+
+
+def resumed(body: SimModel, world: World, seed: int, files: CheckpointFiles | None) -> Simulation:
+    """Resume at the checkpoint of an earlier process of this run, or start the world.
+
+    Raises ConfigError as `Simulation` does.
+    """
+    if files:
+        try:
+            if checkpoint := files.read():
+                simulation = Simulation(body, world, seed, checkpoint)
+                log.info("the simulation continues at %.2f s", simulation.time_ns / 1e9)
+                return simulation
+        except (ConfigError, OSError) as error:
+            log.warning("the simulation starts from the beginning: %s", error)
+            files.clear()
+    return Simulation(body, world, seed)
 
 
 def _digest(model: mujoco.MjModel) -> bytes:

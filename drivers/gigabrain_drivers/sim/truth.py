@@ -139,10 +139,14 @@ class Truth:
                 self.contacts += 1
             self._last_touch[thing] = self._steps
 
+    @property
+    def tipped(self) -> bool:
+        """True while the base is tilted too far to stand."""
+        return bool(self._data.xmat[self._base, 8] < FALL_TILT)
+
     def _fall(self) -> None:
         """Count the start of a fall."""
-        tipped = self._data.xmat[self._base, 8] < FALL_TILT
-        fallen = bool(tipped or self._data.geom_xpos[self._parts, 2].min() < 0.0)
+        fallen = bool(self.tipped or self._data.geom_xpos[self._parts, 2].min() < 0.0)
         self.falls += fallen and not self._fallen
         self._fallen = fallen
 

@@ -128,6 +128,7 @@ class FreeArm:
 
     def __init__(self, robot: RobotFile = ROBOT, folder: Path = FOLDER) -> None:
         self.robot, self.run = robot, Run(folder=folder)
+        self.resumed = False
         home = robot.arm.home if robot.arm else ()
         self.free = {
             joint.name: FreeJoint(joint.lower - 0.02, joint.upper + 0.02, at, stall_torque=1.91)

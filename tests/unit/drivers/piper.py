@@ -79,7 +79,7 @@ class Body:
     def __init__(self, *angles: float) -> None:
         self.places = dict.fromkeys((*ARM, "gripper"), 0.0) | dict(zip(ARM, angles, strict=False))
         self.speeds = dict.fromkeys(self.places, 0.0)
-        self.robot = ROBOT
+        self.robot, self.resumed = ROBOT, False
 
     @property
     def joints(self) -> tuple[Motor, ...]:

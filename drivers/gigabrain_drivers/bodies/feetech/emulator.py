@@ -41,7 +41,7 @@ class FeetechArm(Device):
         self.bus = ServoBus([*self.servos.values(), *self.wheels.values()])
         self._decoder = FeetechDecoder()
         self._stepped_ns: int | None = None
-        self._started = False
+        self._started = body.resumed
 
     def reset(self) -> None:
         """Power on. After a restart there is no torque, and joints stay where they were."""

@@ -96,7 +96,7 @@ class Piper(Device):
             piper.CONFIGURE: self._configure,
             piper.FIRMWARE: self._send_version,
         }
-        self._started = False
+        self._started = body.resumed
         self._forget()
 
     @classmethod
