@@ -1,5 +1,7 @@
 """The driver of a ROS 2 robot on a machine whose network changes."""
 
+from pathlib import Path
+
 import pytest
 
 from gigabrain_drivers.bodies.ros2 import link
@@ -42,3 +44,17 @@ async def test_a_driver_with_a_robot_does_not_join_again(monkeypatch: pytest.Mon
         assert not await joins_again(bench)
         await bench.robot.die()
         assert await joins_again(bench)
+
+
+async def test_a_driver_follows_an_emulator_to_its_new_address(tmp_path: Path) -> None:
+    file = tmp_path / "base"
+    file.write_text('{"domain": 150}')
+    async with running(options_with(port=str(file))) as bench:
+        await bench.found_after_ms()
+        assert not await joins_again(bench)
+        file.unlink()  # as while it is unplugged
+        assert not await joins_again(bench)
+        file.write_text('{"domain": 151}')
+        assert await joins_again(bench)
+        assert not await joins_again(bench)
+        assert await bench.found_after_ms() <= 500

@@ -26,7 +26,9 @@ def drives(state: RobotState) -> bool:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("body", ["mycustombot", "turtlebot3_waffle", "lekiwi", "alpha"])
+@pytest.mark.parametrize(
+    "body", ["mycustombot", "turtlebot3_waffle", "lekiwi", "alpha", "turtlebot3_ros2"]
+)
 async def test_a_robot_stays_where_it_was_when_its_emulator_is_killed(
     home: Home, body: str
 ) -> None:

@@ -131,3 +131,33 @@ def test_with_a_new_transport_old_messages_do_not_count(robot: Robot) -> None:
     assert robot.problem == "odom: no message yet"
     robot.report()
     assert robot.problem == ""
+
+
+@pytest.mark.parametrize("new_transport", [False, True])
+def test_a_restart_within_reach_of_the_gap_does_not_jump_either(
+    robot: Robot, new_transport: bool
+) -> None:
+    robot.report(46)
+    before = robot.watch.pose.x
+    assert before == pytest.approx(0.5)
+    robot.now_ns += 2_000 * MS
+    robot.stamp_ns += 2_000 * MS
+    robot.x = -0.01
+    if new_transport:
+        robot.watch.restart()
+    robot.report()
+    assert robot.watch.pose.x == before
+    assert "jumped by 0.50 m" in robot.problem
+    robot.report(SETTLE_NS // PERIOD_NS)
+    assert robot.problem == ""
+    assert robot.watch.pose.x == pytest.approx(before + 0.06)
+
+
+def test_a_body_that_comes_back_during_a_gap_has_not_jumped(robot: Robot) -> None:
+    robot.report(46)
+    robot.now_ns += 2_000 * MS
+    robot.stamp_ns += 2_000 * MS
+    robot.x = 0.1
+    robot.report()
+    assert robot.problem == ""
+    assert robot.watch.pose.x == pytest.approx(0.11)

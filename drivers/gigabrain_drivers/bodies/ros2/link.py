@@ -17,7 +17,8 @@ from gigabrain_drivers.links import link as links
 from gigabrain_drivers.links.link import Trace
 from gigabrain_schemas.base import Velocity
 from gigabrain_zenoh.clock import Clock
-from gigabrain_zenoh.errors import BadPayload
+from gigabrain_zenoh.config.settings import Ros2Link
+from gigabrain_zenoh.errors import BadPayload, ConfigError
 from gigabrain_zenoh.logs import Fault
 from gigabrain_zenoh.ros2.opening import load_types, open_transport
 from gigabrain_zenoh.ros2.qos import Qos
@@ -40,8 +41,6 @@ Handler = Callable[[Any], None]  # handles a message; may raise Unusable
 @functools.cache
 def all_types() -> Types:
     """Return all ROS types. The first call takes a moment."""
-    from gigabrain_zenoh.config.settings import Ros2Link
-
     return load_types(Ros2Link())
 
 
@@ -62,6 +61,7 @@ class RosLink:
         self._command: RosPublisher | None = None
         self._task: asyncio.Task[None] | None = None
         self._types: Types | None = None
+        self._joined: Ros2Link | None = None  # settings with which it joined
 
     def __str__(self) -> str:
         options = self._options
@@ -110,8 +110,8 @@ class RosLink:
 
     @contextlib.asynccontextmanager
     async def _open_transport(self) -> Any:
-        link = self._options.link()
-        async with open_transport(link, await asyncio.to_thread(all_types)) as transport:
+        assert self._joined
+        async with open_transport(self._joined, await asyncio.to_thread(all_types)) as transport:
             yield transport
 
     async def _keep_open(self) -> None:
@@ -119,6 +119,7 @@ class RosLink:
         while True:
             try:
                 self._types = await asyncio.to_thread(all_types)
+                self._joined = self._options.link()
                 async with self._opener() as transport:
                     fault.end(f"{self}: joined")
                     self._attach(transport)
@@ -134,8 +135,12 @@ class RosLink:
     async def _until_network_changes(self) -> None:
         """Return once this host has only other addresses than before, and no robot is connected.
 
-        Cyclone DDS stays on the interface on which it joined.
+        Cyclone DDS stays on the interface on which it joined. Return also once an emulator has
+        another address than before.
         """
+        if self._options.port:
+            await self._until_emulator_moves()
+            return
         if not self._options.bound:
             await asyncio.Event().wait()
         joined = outer_addresses()
@@ -144,6 +149,13 @@ class RosLink:
             if present and not present & joined and not self.readers:
                 log.info("%s: the network has changed; joining again", self)
                 return
+
+    async def _until_emulator_moves(self) -> None:
+        async for _ in self._clock.every(ADDRESS_CHECK_NS):
+            with contextlib.suppress(ConfigError):  # it is not running
+                if self._options.link() != self._joined:
+                    log.info("%s: the emulator has another address; joining again", self)
+                    return
 
     def _attach(self, transport: RosTransport) -> None:
         self.transport, self.problem = transport, ""

@@ -7,6 +7,7 @@ a moment, because the robot may have restarted.
 import math
 from typing import NamedTuple
 
+import numpy as np
 from msgspec import structs
 
 from gigabrain_schemas.arrays import Floats
@@ -19,6 +20,7 @@ SETTLE_NS = 300_000_000  # a fault is over after this time of valid odometry
 PUSHED_FACTOR = 1.5  # a pushed body may reach this multiple of its maximum speed
 MAX_RATE_FACTOR = 3.0  # a reported turn rate above this multiple of the maximum is impossible
 JUMP_M, JUMP_RAD = 0.1, 0.3  # a motion beyond the possible one by more than this is a jump
+RESTARTED_M, RESTARTED_RAD = 0.05, 0.1  # odometry that restarted at rest is within this of zero
 MAX_BACK_NS = 20_000_000  # a stamp may be this much older than the last, if there are two threads
 
 
@@ -121,9 +123,12 @@ class OdometryWatch:
         if self._received_ns is not None:  # stamps may jump ahead, arrival times cannot
             passed_s = min(passed_s, max((now_ns - self._received_ns) / 1e9, 0.0) + 0.5)
         distance, turned = math.hypot(moved[0], moved[1]), abs(float(moved[2]))
+        x, y, yaw = np.abs(sample.pose)
+        restarted = math.hypot(x, y) < RESTARTED_M and yaw < RESTARTED_RAD
+        moved_s = 0.0 if restarted and passed_s * 1e9 > self.timeout_ns else passed_s
         if (
-            distance > PUSHED_FACTOR * self._max_speed * passed_s + JUMP_M
-            or turned > PUSHED_FACTOR * self._max_turn * passed_s + JUMP_RAD
+            distance > PUSHED_FACTOR * self._max_speed * moved_s + JUMP_M
+            or turned > PUSHED_FACTOR * self._max_turn * moved_s + JUMP_RAD
         ):
             self.refuse(
                 f"it jumped by {distance:.2f} m and {math.degrees(turned):.0f} degrees in "
