@@ -12,6 +12,7 @@ from gigabrain_drivers.bodies.turtlebot3.driver import OpenCrDriver, is_opencr
 from gigabrain_drivers.bodies.turtlebot3.emulator import OpenCr
 from gigabrain_drivers.driver.catalog import make_driver
 from gigabrain_drivers.driver.robot import Run
+from gigabrain_drivers.emulators.base import Snapshot
 from gigabrain_drivers.emulators.emulator import Station, emulated_body
 from gigabrain_drivers.emulators.faults import Faults
 from gigabrain_drivers.emulators.ports import Pty
@@ -140,6 +141,36 @@ async def test_garbage_and_a_board_restart_do_not_move_the_pose(rig: Rig) -> Non
     rig.board._table[136] = 99_999
     state = await rig.drive(0.0, 0.0, 100)
     assert (state.pose.x, state.pose.y) == pytest.approx((0, 0), abs=1e-3)
+
+
+async def test_a_board_that_restarted_during_a_loss_does_not_move_the_pose(rig: Rig) -> None:
+    await rig.drive(0.0, 0.0, 1000)
+    rig.cable.drop("unplugged")
+    rig.board.reset()
+    rig.body.snapshot = turned(rig.body.snapshot, 10.0)
+    await rig.wait(3000)  # long enough to turn the wheels as far as their counters jump
+    rig.cable.plug()
+    state = await rig.drive(0.0, 0.0, 100)
+    assert state.link.connected
+    assert (state.pose.x, state.pose.y) == pytest.approx((0, 0), abs=1e-3)
+    rig.body.snapshot = turned(rig.body.snapshot, 0.1)
+    state = await rig.drive(0.0, 0.0, 100)
+    assert state.pose.x == pytest.approx(0.0033, abs=1e-4)
+
+
+async def test_a_body_that_is_pushed_during_a_loss_moves_its_pose(rig: Rig) -> None:
+    await rig.drive(0.0, 0.0, 1000)
+    rig.cable.drop("unplugged")
+    rig.body.snapshot = turned(rig.body.snapshot, 10.0)
+    await rig.wait(3000)
+    rig.cable.plug()
+    assert (await rig.drive(0.0, 0.0, 100)).pose.x == pytest.approx(0.33, abs=1e-3)
+
+
+def turned(now: Snapshot, angle: float) -> Snapshot:
+    """Return measurements of wheels that turned by `angle` [rad] since."""
+    wheels = (wheel._replace(position=wheel.position + angle) for wheel in now.wheels)
+    return now._replace(wheels=tuple(wheels))
 
 
 @pytest.mark.parametrize(

@@ -52,6 +52,7 @@ FLUSH_S = 0.05  # for the last zero to arrive before the port is closed
 JOINTS = ("wheel_left_joint", "wheel_right_joint")
 PUSHED_FACTOR = 1.5  # factor on the maximal speed, for a body that is pushed
 TURN_SLACK_RAD = 0.1  # [rad], tolerance; a larger jump between two readings is a counter reset
+RESTART_MS = 500  # the board's clock is off by at least this after a restart
 MAX_IMU_VALUE = 1000.0  # [m/s2] and [rad/s]; larger values are no measurements
 
 
@@ -263,7 +264,7 @@ class OpenCrDriver(Driver):
         self._base, self._odometry = base, WheelOdometry(base)
         self._encoders = Encoders(opencr.TICKS, bits=32)
         self._commanded_ns = self._clock.now_ns()
-        self._milliseconds = 0  # the board's clock
+        self._milliseconds, self._received_ns = 0, 0  # the board's clock, and ours, as last read
         self._state = RobotState(
             robot_type=robot.robot_type, pose=Pose(x=0.0, y=0.0, yaw=0.0), velocity=Velocity()
         )
@@ -333,8 +334,10 @@ class OpenCrDriver(Driver):
 
     def _take(self, now: Readings) -> None:
         turned = self._encoders.turned(now.ticks)
-        passed = now.milliseconds - self._milliseconds
-        self._milliseconds = now.milliseconds
+        now_ns, passed = self._clock.now_ns(), now.milliseconds - self._milliseconds
+        if abs((now_ns - self._received_ns) / 1e6 - passed) > RESTART_MS:
+            passed = 0  # its counters have restarted
+        self._milliseconds, self._received_ns = now.milliseconds, now_ns
         furthest = PUSHED_FACTOR * opencr.MAX_WHEEL_SPEED * passed / 1000 + TURN_SLACK_RAD
         if max(map(abs, turned)) <= furthest:
             self._odometry.add(turned)
