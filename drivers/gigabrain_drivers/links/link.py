@@ -197,7 +197,7 @@ class Link(abc.ABC):
                 async with asyncio.timeout(AGE_CHECK_S):
                     await self._ended.wait()
             if self.quiet_ns is not None and self.age_ns > self.quiet_ns:
-                self.drop(f"no data for {self.age_ns / 1e6:.0f} ms")
+                self.drop(f"no data for {self.quiet_ns / 1e6:.0f} ms")
 
     def _readable(self) -> None:
         if self._fd is None:

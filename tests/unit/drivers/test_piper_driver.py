@@ -213,6 +213,28 @@ async def test_feedback_that_ends_is_reported_within_120_ms_and_logged(
     assert sent["joint1"] == pytest.approx(0.0, abs=1e-4)
 
 
+async def test_a_dead_bus_that_is_opened_again_and_again_is_logged_once(
+    rig: Rig, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level(logging.INFO)
+    rig.cable.cut = True
+    for _ in range(10):
+        await rig.wait(200)
+        rig.cable.drop("no data for 200 ms")
+        await rig.wait(100)
+        rig.cable.plug()
+    assert [record.message for record in caplog.records if record.levelname == "WARNING"] == [
+        "memory: no data for 200 ms",
+        f"memory: {NOTHING_COMES}",
+    ]
+    rig.cable.cut = False
+    await rig.wait(100)
+    assert caplog.records[-1].message == "memory: the arm reports, and all is well"
+    rig.cable.cut = True
+    await rig.wait(800)
+    assert caplog.records[-1].message == f"memory: {NOTHING_COMES}"
+
+
 async def test_after_a_loss_it_starts_from_where_the_arm_is(rig: Rig) -> None:
     await rig.move(1000, joint1=0.5)
     rig.cable.drop("unplugged")

@@ -88,7 +88,7 @@ class PiperDriver(Driver):
         self._unplaced = True  # the gate does not yet know the position after a new connection
         self._open = False
         self._well_ns = self._clock.now_ns()
-        self._fault, self._named = Fault(log), ""
+        self._fault, self._named = Fault(log), set[str]()  # problems since all was well
         self._task: asyncio.Task[None] | None = None
 
     @classmethod
@@ -269,13 +269,17 @@ class PiperDriver(Driver):
             self._send(self._feedback.positions, piper.enable(on=True))
 
     def _log_problem(self, now_ns: int) -> None:
-        """Log a lasting problem once when it begins, and once when it ends."""
+        """Log each lasting problem once when it begins, and the end of all once.
+
+        A silent bus is opened again and again, so two problems alternate.
+        """
         problem = self.problem
         if not problem:
-            self._well_ns, self._named = now_ns, ""
+            self._well_ns, self._named = now_ns, set()
             self._fault.end(f"{self.link}: the arm reports, and all is well")
-        elif now_ns - self._well_ns >= LOG_AFTER_NS and problem != self._named:
-            self._named, self._fault = problem, Fault(log)
+        elif now_ns - self._well_ns >= LOG_AFTER_NS and problem not in self._named:
+            self._named.add(problem)
+            self._fault = Fault(log)
             self._fault.begin(problem if str(self.link) in problem else f"{self.link}: {problem}")
 
     def _health(self) -> LinkHealth:
