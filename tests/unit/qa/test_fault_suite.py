@@ -131,8 +131,8 @@ def test_a_body_without_the_line_in_question_is_skipped() -> None:
         deployment_of(Options(body="alpha"), "serial")
 
 
-def test_deaths_of_the_driver_are_judged_on_whatever_line_a_body_has() -> None:
-    assert [fault.number for fault in FAULTS if fault.stage == "line"] == [7, 8, 11]
+def test_deaths_of_driver_and_emulator_are_judged_on_any_line_of_a_body() -> None:
+    assert [fault.number for fault in FAULTS if fault.stage == "line"] == [7, 8, 11, 64]
     assert deployment_of(Options(), "line") == deployment_of(Options(), "serial")
     assert deployment_of(Options(body="alpha"), "line").link == "emulated"
     with pytest.raises(Skipped, match="mock has no line"):

@@ -3,9 +3,12 @@
 import asyncio
 import contextlib
 import itertools
+import math
 import random
 import signal
 import time
+from collections.abc import Mapping
+from typing import Any
 
 import psutil
 
@@ -66,6 +69,7 @@ NOT_REPORTED = Figure("faults not reported")
 WAIT_TOO_SHORT = Figure("wait too short", "s")
 CPU_ADDED = Figure("cpu added", "%")
 IDLE = Figure("idle after", "s")
+DISPLACED, POSE_JUMPED = Figure("displaced", "m"), Figure("pose jumped", "m")
 LATCH_IGNORED = Figure("latches ignored")
 
 
@@ -263,6 +267,32 @@ async def _without_driver(robot: RobotUnderTest) -> tuple[float, float]:
     await robot.until_restarted("driver", pid)
     zero_s = float(after["motors_moved_s"]) - float(before["sim_seconds"])
     return zero_s * 1e3, float(after["distance_m"]) - float(before["distance_m"])
+
+
+@fault_row(64, "line", DISPLACED.at_most(0.1), POSE_JUMPED.at_most(0.1), STAYS_STILL)
+async def emulator_killed(rig: Rig) -> Measured:
+    """Kill the emulator, as by a power cut of the body: it stays where it is, in its pose too."""
+    robot = await rig.robot("line")
+    probe = robot.probe
+    while await robot.travelled() < ROOM_M:  # away from the start
+        await robot.until_driving()
+    before = await robot.prompt_truth()
+    pid = robot.kill("emulator")
+    await until(lambda: not probe.state.link.connected, "the driver loses the body")
+    lost = probe.state.pose
+    await robot.until_restarted("emulator", pid)
+    await until(lambda: probe.state.link.connected, "the driver finds the body")
+    found, after = probe.state.pose, await robot.truth()
+    await probe.ticks(RESTED_TICKS)
+    return {
+        DISPLACED: math.dist(_place(before), _place(after)),
+        POSE_JUMPED: math.dist((lost.x, lost.y), (found.x, found.y)),
+        MOVED_AGAIN: await robot.travelled() - float(after["distance_m"]),
+    }
+
+
+def _place(truth: Mapping[str, Any]) -> tuple[float, float]:
+    return float(truth["true_x"]), float(truth["true_y"])
 
 
 @fault_row(11, "line", IDLE.at_most(10), STAYS_STILL)
