@@ -3,6 +3,7 @@
 import asyncio
 import os
 import select
+import socket
 import subprocess
 import sys
 import termios
@@ -11,10 +12,14 @@ from pathlib import Path
 
 import pytest
 
+from gigabrain_drivers.bodies.ros2 import emulator as ros2_emulator
+from gigabrain_drivers.bodies.ros2.emulator import RosPort
+from gigabrain_drivers.bodies.ros2.options import Address, CommandTopic, Ros2Options, Topics
 from gigabrain_drivers.driver.robot import Run
 from gigabrain_drivers.emulators.emulator import Emulator, claimed
 from gigabrain_drivers.emulators.ports import Pty
 from gigabrain_zenoh.errors import ConfigError
+from gigabrain_zenoh.testing.processes import free_endpoint
 from gigabrain_zenoh.testing.waiting import until
 
 
@@ -160,3 +165,28 @@ def test_a_folder_of_ports_can_be_used_by_one_emulator_only(tmp_path: Path) -> N
         claimed(tmp_path / "file"),
     ):
         pass
+
+
+async def test_emulated_nodes_whose_port_is_taken_use_another(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    command = CommandTopic(type="geometry_msgs/msg/Twist")
+    options = Ros2Options(
+        driver="ros2",
+        transport="rmw_zenoh",
+        port=str(tmp_path / "base"),
+        topics=Topics(command=command),
+        watchdog="none",
+    )
+    port = RosPort(tmp_path / "base", options)
+    with socket.socket() as other:
+        other.bind(("127.0.0.1", 0))
+        other.listen()
+        taken = f"tcp/127.0.0.1:{other.getsockname()[1]}"
+        addresses = iter([Address(router=taken), Address(router=free_endpoint())])
+        monkeypatch.setattr(ros2_emulator, "_free_address", lambda _: next(addresses))
+        port.plug()
+        await until(port.path.exists, "the nodes")
+        assert taken not in port.path.read_text()
+        port.unplug()
+        await until(lambda: not port.path.exists(), "the end of the nodes")

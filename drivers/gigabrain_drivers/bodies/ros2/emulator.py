@@ -99,6 +99,7 @@ class RosPort:
                     await asyncio.Event().wait()
             except GigabrainError as error:
                 fault.begin(f"emulated nodes: {error}")
+                self._address = None  # another process may have taken it meanwhile
                 await asyncio.sleep(0.5)
 
     @contextlib.asynccontextmanager
