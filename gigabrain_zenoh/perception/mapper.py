@@ -156,6 +156,8 @@ class Mapper:
         body = self._bodies.current
         if body:
             self._reset_odometry(state.boot, body.description)
+            if not state.link.connected:  # its turn rate is that of the last message
+                state = replace(state, imu=None)
             self._fusion.add(state, body.description)
 
     def _autosave_of(self, config: PerceptionConfig) -> Autosave | None:

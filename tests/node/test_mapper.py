@@ -8,9 +8,11 @@ import pytest
 from msgspec.structs import replace
 
 from gigabrain_schemas.base import Message
+from gigabrain_schemas.body import LinkHealth
 from gigabrain_schemas.brain import OccupancyGrid, PoseInMap
 from gigabrain_schemas.examples import example
 from gigabrain_schemas.safety import Health
+from gigabrain_schemas.sensors import ImuData
 from gigabrain_schemas.topics import HEALTH, MAP, POSE, SCAN, STATE, WORLD, ZONES, Topic
 from gigabrain_zenoh.codec import Codec
 from gigabrain_zenoh.config import loading as config
@@ -158,6 +160,23 @@ async def test_a_jump_of_the_odometry_is_reported_and_the_robot_relocalized(
     assert pose.localized
     assert pose.x == pytest.approx(0.004 * (base - 5), abs=0.04)
     assert "not localized: the odometry has jumped" in caplog.messages
+
+
+async def test_the_last_turn_rate_of_a_lost_body_does_not_turn_its_pose() -> None:
+    turning = ImuData(
+        orientation=(0, 0, 0, 1), angular_velocity=(0, 0, 1.0), linear_acceleration=(0, 0, 9.8)
+    )
+    async with Robot() as robot:
+        robot.publish_body()
+        robot.drive(10, still=True)
+        lost = replace(state(), boot=robot.boot, imu=turning, link=LinkHealth(connected=False))
+        for _ in range(80):  # the driver repeats what it knows
+            robot.tick += 1
+            robot.send(STATE, replace(lost, tick=robot.tick))
+        robot.drive(5, still=True)
+        poses = robot.sent(POSE)
+    assert all(pose.localized for pose in poses)
+    assert [pose.yaw for pose in poses] == pytest.approx([0.0] * 15, abs=0.01)
 
 
 async def test_after_a_restart_of_the_driver_the_map_stays_and_the_robot_is_localized() -> None:
