@@ -20,6 +20,7 @@ from gigabrain_drivers.emulators.emulator import Station, emulated_body
 from gigabrain_drivers.emulators.faults import NO_FAULTS, Faults
 from gigabrain_drivers.emulators.ports import TcpPort
 from gigabrain_drivers.kinematics.legs import JOINT_NAMES, WALKER
+from gigabrain_drivers.kinematics.wheels import Twist
 from gigabrain_drivers.links.tcp_link import address
 from gigabrain_schemas.topics import IMU
 from gigabrain_zenoh.clock import Clock
@@ -134,6 +135,22 @@ async def test_a_replugged_body_is_found_again(rig: Rig) -> None:
     rig.station.set(NO_FAULTS)
     await until(lambda: rig.connected[-1])
     assert rig.driver.link.reconnects >= 1
+
+
+async def test_a_new_connection_begins_without_the_velocity_of_the_last_one(rig: Rig) -> None:
+    rig.streaming = (0.3, 0.0, 0.0)
+    await until(lambda: rig.driver._odometry.velocity.linear_x > 0.2)
+    opened, velocities = rig.driver.link.on_open, list[Twist]()
+
+    def open_and_note() -> None:
+        opened()
+        velocities.append(rig.driver._odometry.velocity)
+
+    rig.driver.link.on_open = open_and_note
+    rig.driver.link.drop("cut")
+    await until(lambda: velocities)
+    assert velocities == [Twist(0.0, 0.0, 0.0)]
+    assert rig.driver._odometry.pose.x > 0.0
 
 
 async def test_a_thawed_body_executes_no_old_commands(rig: Rig) -> None:

@@ -222,10 +222,16 @@ class LegOdometry:
 
     def __init__(self, geometry: LegGeometry) -> None:
         self._geometry = geometry
-        self._contacts: tuple[bool, ...] = (False,) * 4  # of the last sample
-        self._velocity = (0.0, 0.0, 0.0)  # [m/s], in the body's frame
+        self._contacts: tuple[bool, ...]  # of the last sample
+        self._velocity: Vector  # [m/s], in the body's frame
+        self.velocity: Twist  # along the floor
         self.pose = Pose(x=0.0, y=0.0, yaw=0.0)
-        self.velocity = Twist(0.0, 0.0, 0.0)  # along the floor
+        self.rest()
+
+    def rest(self) -> None:
+        """Forget the velocity, as samples are missing; keep the pose."""
+        self._contacts, self._velocity = (False,) * 4, (0.0, 0.0, 0.0)
+        self.velocity = Twist(0.0, 0.0, 0.0)
 
     def update(self, senses: Senses, passed_s: float) -> None:
         """Integrate a sample, `passed_s` after the last one."""

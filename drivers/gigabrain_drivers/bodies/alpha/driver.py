@@ -152,6 +152,7 @@ class AlphaDriver(Driver):
         """Reset all state for a new connection."""
         self._decoder.clear()
         self._liveness.reset()
+        self._odometry.rest()
         self._last = None
 
     def _lost(self, why: str) -> None:
