@@ -238,6 +238,7 @@ def _open_standard_streams() -> None:
     while (number := os.open(os.devnull, os.O_RDWR)) <= 2:
         os.set_inheritable(number, True)
     os.close(number)
+    sys.stdin = sys.stdin or os.fdopen(0)
     sys.stdout = sys.stdout or os.fdopen(1, "w")
     sys.stderr = sys.stderr or os.fdopen(2, "w")
 
@@ -281,3 +282,14 @@ def _call(words: "Sequence[str]") -> object:
 
         print(f"gigabrain: {usage_error(error)}", file=sys.stderr)
         return ConfigError.exit_code
+    except UnicodeEncodeError:
+        wrong = next((word for word in words if not _is_text(word)), None)
+        if wrong is None:
+            raise
+        print(f"gigabrain: '{printable(wrong)}': expected UTF-8 text", file=sys.stderr)
+        return ConfigError.exit_code
+
+
+def _is_text(word: str) -> bool:
+    """Return whether an argument, which may be any bytes of the system, is UTF-8 text."""
+    return word == word.encode(errors="replace").decode()

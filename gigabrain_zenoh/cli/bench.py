@@ -11,6 +11,7 @@ from rich.table import Table
 from rich.text import Text
 
 from gigabrain_zenoh.cli.options import (
+    AnySeed,
     Body,
     JsonFile,
     Seed,
@@ -251,7 +252,7 @@ def plan(
     *,
     size: tuple[int, ...] = (1000, 2000),
     queries: int = 20,
-    seed: int = 0,
+    seed: AnySeed = 0,
     json: JsonFile = None,
     png: Path | None = None,
 ) -> int:

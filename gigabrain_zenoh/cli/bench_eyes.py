@@ -8,6 +8,7 @@ from rich.table import Table
 
 from gigabrain_zenoh.cli.bench import finish, side_by_side
 from gigabrain_zenoh.cli.options import (
+    AnySeed,
     Body,
     JsonFile,
     World,
@@ -31,7 +32,7 @@ def eyes(
     worlds: int = 40,
     seconds: float = 8.0,
     ghosts: int = 30,
-    seed: int = 0,
+    seed: AnySeed = 0,
     json: JsonFile = None,
 ) -> int:
     """Measure obstacle contours against the simulator's truth, with a sensor's errors and without.

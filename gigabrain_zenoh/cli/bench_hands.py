@@ -6,7 +6,14 @@ from typing import TYPE_CHECKING
 from rich.table import Table
 
 from gigabrain_zenoh.cli.bench import finish
-from gigabrain_zenoh.cli.options import Body, JsonFile, check_names, check_positive, print_progress
+from gigabrain_zenoh.cli.options import (
+    AnySeed,
+    Body,
+    JsonFile,
+    check_names,
+    check_positive,
+    print_progress,
+)
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.host import files
 from gigabrain_zenoh.host.bounded import percentile
@@ -98,7 +105,7 @@ def reach(
     *,
     body: Body = "so101",
     goals: int = 1000,
-    seed: int = 0,
+    seed: AnySeed = 0,
     json: JsonFile = None,
 ) -> int:
     """Have an arm go to random goals near its body, judged by the physics.

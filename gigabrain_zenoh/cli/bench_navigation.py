@@ -14,7 +14,14 @@ from rich.table import Table
 from rich.text import Text
 
 from gigabrain_zenoh.cli.bench import finish, side_by_side
-from gigabrain_zenoh.cli.options import Body, JsonFile, check_names, check_positive, print_progress
+from gigabrain_zenoh.cli.options import (
+    AnySeed,
+    Body,
+    JsonFile,
+    check_names,
+    check_positive,
+    print_progress,
+)
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.host import files
 from gigabrain_zenoh.host.signals import run_async
@@ -33,7 +40,7 @@ def slam(
     world: Annotated[tuple[str, ...], Parameter(consume_multiple=True)] = (),
     minutes: float = 10.0,
     body: Body = "turtlebot3_waffle",
-    seed: int = 0,
+    seed: AnySeed = 0,
     png: Path | None = None,
     json: JsonFile = None,
 ) -> int:
@@ -312,7 +319,7 @@ def goals(*, options: GoalsOptions = GOALS, json: JsonFile = None, logs: Path | 
     """
     from gigabrain_zenoh.qa.bench.goals import GoalCourse, measure_goals
 
-    check_positive(goals=options.goals, speed=options.speed)
+    check_positive(goals=options.goals, speed=options.speed, hours=options.hours or None)
     check_names(options.bodies, options.worlds)
     files.check_result_path(json)
     course = GoalCourse(

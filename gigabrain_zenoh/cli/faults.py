@@ -11,9 +11,15 @@ from typing import TYPE_CHECKING, Annotated
 
 import msgspec
 from cyclopts import Parameter
-from cyclopts.validators import Number
 
-from gigabrain_zenoh.cli.options import JsonFile, check_names, print_line, print_table
+from gigabrain_zenoh.cli.options import (
+    AnySeed,
+    JsonFile,
+    check_names,
+    check_positive,
+    print_line,
+    print_table,
+)
 from gigabrain_zenoh.decision import behaviours
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.host import files
@@ -84,7 +90,7 @@ def faults(
     list_: Annotated[bool, Parameter(name="--list", negative=())] = False,
     only: Annotated[tuple[str, ...], Parameter(consume_multiple=True)] = (),
     skip: Annotated[tuple[str, ...], Parameter(consume_multiple=True)] = (),
-    repeat: Annotated[int, Parameter(validator=Number(gte=1))] = 1,
+    repeat: int = 1,
     robot: SuiteOptions = DEFAULT,
     into: Path | None = None,
     json: JsonFile = None,
@@ -106,6 +112,7 @@ def faults(
     """
     from gigabrain_zenoh.qa.faults.suite import choose, failed
 
+    check_positive(repeat=repeat)
     left_out = choose(skip) if skip else ()
     chosen = tuple(fault for fault in choose(only) if fault not in left_out)
     if not chosen:
@@ -206,7 +213,7 @@ def proxy(
     listen: str = "tcp/127.0.0.1:0",
     baud: int = 115200,
     chaos: str = "",
-    seed: int = 0,
+    seed: AnySeed = 0,
     insecure: bool = False,
 ) -> int:
     """Emulate a bad network in front of a router or a robot's port, until Ctrl-C.
@@ -227,6 +234,7 @@ def proxy(
         insecure: Listen beyond loopback: others on the network can then reach the robot.
     """
     first = parse_command(chaos)
+    check_positive(baud=baud)
     if to.startswith("/"):
         from gigabrain_zenoh.qa.proxy.serial import LineProxy
 

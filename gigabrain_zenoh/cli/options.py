@@ -40,6 +40,7 @@ R = TypeVar("R")
 
 COMPLETION_TIMEOUT_S = 0.3  # a shell waits for the names
 MAX_NAME_CHARS = 64
+MAX_SEED = 2**32
 MAX_SHOWN_CHARS = 60  # of a value in an error
 PIPE_COLUMNS = 160  # width of tables in a pipe
 UNIT = re.compile("_(s|mb)$")  # suffix of settings that their options do not have
@@ -130,6 +131,12 @@ def _live_processes() -> list["Description"]:
         return []
 
 
+def _check_seed(_: object, seed: int) -> None:
+    """Raise ConfigError for a seed that no generator of random numbers takes."""
+    if not 0 <= seed <= MAX_SEED:
+        raise ConfigError(f"--seed: expected a whole number >= 0 and <= {MAX_SEED}, got {seed}")
+
+
 Topic = Annotated[
     str,
     Parameter(
@@ -164,7 +171,11 @@ Body = Annotated[
 World = Annotated[
     str, Parameter(help="Simulated world, or path of a world file; see `gigabrain worlds`.")
 ]
-Seed = Annotated[int, Parameter(help="Random seed of the start pose and the sensor noise.")]
+Seed = Annotated[
+    int,
+    Parameter(help="Random seed of the start pose and the sensor noise.", validator=_check_seed),
+]
+AnySeed = Annotated[int, Parameter(validator=_check_seed)]
 KeepStuck = Annotated[
     bool,
     Parameter(help="Do not restart a process that makes no progress (for a debugger)."),

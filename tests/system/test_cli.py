@@ -105,6 +105,18 @@ def test_a_command_runs_with_a_closed_stream(stream: int, words: str, code: int)
     assert bool(command.stdout) is (stream == 2 and code == 0)
 
 
+@pytest.mark.parametrize("words", ["arm limp", "teleop"])
+def test_a_question_without_an_input_is_refused_in_one_line(words: str) -> None:
+    closing = (
+        f"import os, sys; os.close(0); os.execv(sys.executable, {[*GIGABRAIN, *words.split()]})"
+    )
+    command = subprocess.run(
+        (sys.executable, "-c", closing), capture_output=True, text=True, check=False
+    )
+    assert (command.returncode, command.stderr.count("\n")) == (2, 1)
+    assert command.stderr.startswith(f"gigabrain: {words} needs ")
+
+
 @pytest.mark.parametrize("closed", [(2,), (0, 1, 2)])
 async def test_a_robot_runs_with_closed_streams(closed: tuple[int, ...], tmp_path: Path) -> None:
     report = tmp_path / "report.json"

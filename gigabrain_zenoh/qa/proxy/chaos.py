@@ -8,6 +8,7 @@ import msgspec
 from msgspec import Meta, Struct
 
 from gigabrain_schemas.base import NonNegative
+from gigabrain_zenoh.config.name_words import plain
 from gigabrain_zenoh.errors import ConfigError, unknown
 
 Chance = Annotated[float, Meta(ge=0.0, le=1.0)]
@@ -73,7 +74,7 @@ def parse_struct(words: list[str], kind: type[S], others: tuple[str, ...] = ()) 
     try:
         return msgspec.convert({n: v or "true" for n, v in values.items()}, kind, strict=False)
     except msgspec.ValidationError as error:
-        raise ConfigError(f"{' '.join(words)!r}: {error}") from None
+        raise ConfigError(f"{' '.join(words)!r}: {plain(error)}") from None
 
 
 MAX_GARBAGE_BYTES = 64

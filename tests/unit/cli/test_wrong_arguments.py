@@ -78,6 +78,32 @@ LINES = [
     ("audit --newest 0", "--newest: expected 1 to 1000, got 0"),
     ("config --set seed=1", "--set and --settings need a deployment file"),
     ("why --keys missing", "missing: no folder with keys"),
+    ("render x.png --seed -1", "--seed: expected a whole number >= 0 and <= 4294967296, got -1"),
+    *(
+        (f"{command} --seed -1", "--seed: expected a whole number >= 0 and <= 4294967296, got -1")
+        for command in (
+            "bench plan",
+            "bench eyes",
+            "bench reach so101",
+            "bench slam",
+            "emulate so101",
+        )
+    ),
+    ("proxy tcp/127.0.0.1:1 --seed -1", "--seed: expected a whole number >= 0"),
+    ("proxy /dev/ttyS9 --baud -1", "--baud: expected a number above 0, got -1"),
+    ("proxy tcp/127.0.0.1:1 --chaos delay_ms=-1", "delay_ms: expected a number >= 0.0"),
+    ("bench goals --hours -1", "--hours: expected a number above 0, got -1"),
+    ("faults --repeat 0", "--repeat: expected a number above 0, got 0"),
+    *(
+        (f"{command}\udcff", "\\udcff': expected UTF-8 text")
+        for command in (
+            "keys new ",
+            "pick ",
+            "config demo --set seed=",
+            "router --namespace ",
+            "topic pub cmd_vel linear_x=",
+        )
+    ),
 ]
 
 

@@ -96,7 +96,7 @@ def test_a_command_is_parsed(line: str, command: ProxyCommand) -> None:
     ("line", "complaint"),
     [
         ("holes", r"no fault 'holes'; did you mean 'hole'\? known: .*bytes_s, corrupt"),
-        ("corrupt=2", r"'corrupt=2': Expected `float` <= 1.0 - at `\$.corrupt`"),
+        ("corrupt=2", r"'corrupt=2': corrupt: expected a number <= 1.0"),
         ("delay_ms=nan", "delay_ms=nan"),
         ("hole cut", "no fault 'cut'"),
     ],
