@@ -2,6 +2,7 @@
 
 import asyncio
 import math
+import re
 import sys
 from collections.abc import Awaitable, Callable
 from typing import TYPE_CHECKING, Annotated
@@ -320,7 +321,10 @@ def _carry_out(at: RobotAddress, mission: "Mission", mode: Mode, wait: bool) -> 
     from gigabrain_zenoh.decision.tasks.mission_files import loads
 
     text, label = text_of(mission), describe(mission.arm_actions[0])
-    loads(text, "arm")  # raises for wrong numbers, before connecting
+    try:
+        loads(text, "arm")  # raises for wrong numbers, before connecting
+    except ConfigError as error:  # the user has typed no file with lines and steps
+        raise ConfigError(re.sub(r"^arm:\d+: (do\[0\]\.|things\.)?", "arm: ", str(error))) from None
     send(at, lambda tasks: tasks.carry_out(text, how=mode, label=label), wait)
 
 

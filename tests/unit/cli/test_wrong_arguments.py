@@ -37,7 +37,7 @@ LINES = [
     ("zone add lab keepout 0 0 1 0 1e9 1", "POINTS: expected a number <= 100000.0"),
     ("zone add lab one_way 0 0 1 0 --width 1e9", "--width: expected a number >= 0.05 and <= 100.0"),
     ("arm jog '' 10", "JOINT: expected a name of 1 to 64 characters, got ''"),
-    ("arm goto 1e9 0 0", "expected a number >= -10.0 and <= 10.0, got 1000000000.0"),
+    ("arm goto 1e9 0 0", "gigabrain: arm: reach.at[0]: expected a number >= -10.0 and <= 10.0"),
     ("objects --forget -1", "--forget: expected a whole number >= 0"),
     ("objects --forget-tag 9999999", "--forget-tag: expected a whole number <= 1000000"),
     ("objects --forget 1 --forget-all", "choose --forget-all, or --forget and --forget-tag"),
