@@ -70,8 +70,8 @@ class FreezableNetwork:
     def transport(self):
         transport = self._network.transport()
         subscribe = transport.subscribe
-        transport.subscribe = lambda key, handle, depth: subscribe(
-            key, lambda *sample: self.frozen or handle(*sample), depth
+        transport.subscribe = lambda key, handle, depth, **lazy: subscribe(
+            key, lambda *sample: self.frozen or handle(*sample), depth, **lazy
         )
         return transport
 

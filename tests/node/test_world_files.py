@@ -117,7 +117,7 @@ def test_all_persons_of_a_world_file_walk(tmp_path: Path) -> None:
         ("size: [6, 4]\nmaterials: {floor: [0, 0, 0]}\n", r":2: materials: 'floor' is there"),
         ("size: [1, 1]\n", r"bad.yaml:1: found no place for the robot"),
         ("size: [6, 4]\nmap: none.yaml\n", r":2: map: .*none.yaml: no such file"),
-        ("size: [6, 4]\nmodel: none.xml\n", r":2: model: .*none.xml: the world's model: No such"),
+        ("size: [6, 4]\nmodel: none.xml\n", r":2: model: .*none.xml: the world's model: no such"),
     ],
 )
 def test_a_bad_world_file_is_refused_in_one_line(text: str, complaint: str, tmp_path: Path) -> None:
