@@ -45,9 +45,21 @@ def estop(*, at: RobotAddress = LOCAL, reason: str = "") -> None:
     if at.keys and not os.path.isdir(os.path.expanduser(at.keys)):
         print_progress(f"no folder {at.keys}: tried without keys")
         at = replace(at, keys=None)
+    confirmed = False
+
+    async def press(robot: Robot) -> GateReply:
+        nonlocal confirmed
+        reply = await robot.estop(reason)
+        confirmed = True
+        return reply
+
     try:
-        _ask(at, lambda robot: robot.estop(reason), "CONFIRMED by ", wait=False)
+        _ask(at, press, "CONFIRMED by ", wait=False)
     except NotConfirmed:
+        raise
+    except KeyboardInterrupt:
+        if not confirmed:
+            print_progress(f"NOT CONFIRMED: ended before a robot answered; {BY_HAND}")
         raise
     except GigabrainError as error:  # any error means that no robot confirmed
         raise NotConfirmed(f"NOT CONFIRMED: {error}; {BY_HAND}") from None
