@@ -189,7 +189,7 @@ def test_each_emulated_run_has_its_own_checkpoint(
     for run_dir in (tmp_path / "one", tmp_path / "two"):
         specs = process_specs(Deployment(link=link), "robot", run_dir, tmp_path / "state")
         found = [
-            msgspec.json.decode(one.argv[-1])["settings"]["checkpoint"]
+            msgspec.json.decode(one.config)["settings"]["checkpoint"]
             for one in specs
             if one.name == "emulator"
         ]
