@@ -6,10 +6,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from gigabrain_drivers.lidars.base import SampleBuffer
 from gigabrain_drivers.lidars.rplidar import protocol as rplidar
 from gigabrain_drivers.lidars.rplidar.protocol import Answer, Info, RequestDecoder, RplidarDecoder
 from gigabrain_drivers.lidars.rplidar.scan_formats import Dense, Samples, encode_dense, encode_node
+from gigabrain_schemas.body import Lidar
+from gigabrain_schemas.sensors import LaserScan
 
+LIDAR = Lidar(beams=360, rate_hz=10, range_min=0.1, range_max=8.0)
 STANDARD = bytes.fromhex("a55a0500004081")
 DENSE = rplidar.descriptor(0x85, 84, endless=True)
 INFO = Info(0x18, (1, 29), 7, "0123456789ABCDEF" * 2)
@@ -59,6 +63,17 @@ def test_a_turn_begins_at_the_first_sample_after_zero() -> None:
     assert (passing.turn_at, passing.angles[9], passing.angles[10]) == (10, 359.0, 360.0)
     assert after is not None
     assert after.turn_at is None
+
+
+def test_each_turn_has_its_last_sample_also_if_a_capsule_ends_with_it() -> None:
+    dense, turn, scans = Dense(), SampleBuffer(LIDAR), list[LaserScan]()
+    for number in range(45):  # 9 capsules make a turn, each at another distance
+        distances = [1000 * (1 + number // 9)] * 40
+        block = encode_dense(number % 9 * 40.0, distances, begins=number == 0)
+        item = dense.decode(block)
+        scan = turn.add_samples(*item, number * 11_111_111) if item else None
+        scans += [scan] if scan else []
+    assert [set(scan.ranges_m.tolist()) for scan in scans] == [{2.0}, {3.0}, {4.0}]
 
 
 @pytest.mark.parametrize("lost", [84, 83, 1])

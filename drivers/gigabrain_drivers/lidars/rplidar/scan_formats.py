@@ -114,7 +114,8 @@ class Capsule(ScanFormat):
         passes_zero = start + width >= 360
         angles = self._angles(last, start, width)
         count = len(angles)
-        turn_at = min(count - 1, -int((start - 360) * count // width)) if passes_zero else None
+        # `count`, if the turn ends with this capsule
+        turn_at = -int((start - 360) * count // width) if passes_zero else None
         return Samples(angles, self._distances(last), turn_at)
 
     def resync(self) -> None:
