@@ -69,5 +69,5 @@ async def test_a_recording_that_cannot_start_is_refused_in_one_line(home: Home) 
     assert none.err.startswith("gigabrain: --split-time: expected a number above 0, got -1")
     assert await none.ended() == 2
     demo = await home.run("demo", "--record", str(there))
-    assert demo.err == f"gigabrain: --record: {there} exists; choose another file\n"
+    assert demo.err == f"gigabrain: {there} exists; choose another file\n"
     assert await demo.ended() == 2
