@@ -36,9 +36,10 @@ from gigabrain_zenoh.bus.zenoh.config import session_config
 from gigabrain_zenoh.config.settings import Endpoint
 from gigabrain_zenoh.diagnostics.discovery import discover
 from gigabrain_zenoh.diagnostics.listener import CLIENT_NAME
-from gigabrain_zenoh.diagnostics.robot_view import ProcessHealth
+from gigabrain_zenoh.diagnostics.robot_view import MAX_PROCESSES, ProcessHealth
 from gigabrain_zenoh.diagnostics.ros2_check import Shell, check_ros2, inspect_shell
 from gigabrain_zenoh.errors import BusError, ConfigError
+from gigabrain_zenoh.host.bounded import put_newest
 from gigabrain_zenoh.host.files import expanded
 from gigabrain_zenoh.host.run_folders import state_dir
 from gigabrain_zenoh.runtime import running
@@ -126,6 +127,7 @@ class RobotFacts(Struct, frozen=True, kw_only=True):
     port_open: bool = False  # another program listens at `router`
     described: Mapping[str, Description] = {}
     health: Mapping[str, Health] = {}  # newest, by process
+    namesakes: Mapping[str, tuple[str, ...]] = {}  # places of processes with one name, by name
     lead_ms: Mapping[str, float] = {}  # smallest lead of our clock over a host's, by host
     control_topic: str = CMD_VEL.key  # key that the body obeys
     unneeded: frozenset[str] = frozenset()  # keys that the body does not need
@@ -137,7 +139,8 @@ def examine(machine: MachineFacts, robot: RobotFacts) -> list[Diagnosis]:
     checks = (
         _python(machine), _libraries(machine), _folders(machine), _serial(machine),
         _multicast(machine), _certificate(machine), _router(robot), _processes(robot),
-        _problems(robot), _rates(robot), _clocks(robot), _load(robot), _ros2(machine, robot),
+        _namesakes(robot), _problems(robot), _rates(robot), _clocks(robot), _load(robot),
+        _ros2(machine, robot),
     )  # fmt: skip
     return list(itertools.chain.from_iterable(checks))
 
@@ -268,6 +271,15 @@ def _processes(robot: RobotFacts) -> Iterator[Diagnosis]:
     if len(versions) > 1:
         cure = "install the same version on all hosts"
         yield _bad("versions", f"the processes differ: {', '.join(sorted(versions))}", cure)
+
+
+def _namesakes(robot: RobotFacts) -> Iterator[Diagnosis]:
+    for name, places in robot.namesakes.items():
+        text = f"{len(places)} processes have this name: {', '.join(places)}"
+        if name in SYSTEMS:
+            yield _bad(name, text, "stop all but one: each acts on the messages of the others")
+        else:
+            yield _hint(name, text, "its health and logs are those of all of them in turn")
 
 
 def _problems(robot: RobotFacts) -> Iterator[Diagnosis]:
@@ -402,12 +414,15 @@ async def _port_open(endpoint: str) -> bool:
 async def _collect(bus: Bus, router: str, seconds: float) -> RobotFacts:
     lead_ms: dict[str, float] = {}
     states: list[RobotState] = []
+    places: dict[str, list[str]] = {}  # in the order of the messages, by process
 
-    def add_lead(newest: Health) -> None:
+    def add(newest: Health) -> None:
+        place = f"pid {newest.pid} on {newest.host}"
+        put_newest(places, newest.process, [*places.get(newest.process, ()), place], MAX_PROCESSES)
         lead = (bus.clock.unix_ns() - newest.stamp_ns) / 1e6
         lead_ms[newest.host] = min(lead, lead_ms.get(newest.host, lead), key=abs)
 
-    health = ProcessHealth(bus, add_lead)
+    health = ProcessHealth(bus, add)
     bodies = bus.latest(BODY)
     bus.subscribe(STATE, lambda _key, state: states.append(state))
     described, _ = await asyncio.gather(discover(bus), asyncio.sleep(seconds))
@@ -416,11 +431,21 @@ async def _collect(bus: Bus, router: str, seconds: float) -> RobotFacts:
         router=router,
         described=described,
         health=health.newest,
+        namesakes=_alternating(places),
         lead_ms=lead_ms,
         control_topic=_control_topic(body),
         unneeded=_unneeded(body),
         pace=_pace(states),
     )
+
+
+def _alternating(places: Mapping[str, Sequence[str]]) -> dict[str, tuple[str, ...]]:
+    """Return the places of processes that publish in turn; those of a restart do not return."""
+    return {
+        name: tuple(dict.fromkeys(found))
+        for name, found in places.items()
+        if any(a != b and a in found[n + 2 :] for n, (a, b) in enumerate(itertools.pairwise(found)))
+    }
 
 
 def _control_topic(body: Body | None) -> str:

@@ -1,5 +1,6 @@
 """`gigabrain doctor`: what is broken on purpose is found, with its cure."""
 
+import asyncio
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +11,8 @@ from gigabrain_schemas.base import Cause
 from gigabrain_schemas.examples import example
 from gigabrain_schemas.requests import Description
 from gigabrain_schemas.safety import Health
+from gigabrain_schemas.topics import HEALTH
+from gigabrain_zenoh.diagnostics import doctor
 from gigabrain_zenoh.diagnostics.doctor import (
     Certificate,
     Diagnosis,
@@ -21,6 +24,7 @@ from gigabrain_zenoh.diagnostics.doctor import (
     exit_code,
     inspect_machine,
 )
+from gigabrain_zenoh.testing.in_memory import Net
 from tests.closed import close_folder
 
 SENT = {
@@ -60,6 +64,30 @@ EXPIRED = Certificate(folder="keys/red", problem="identity.crt expired on 2026-0
 
 def found(machine: MachineFacts = MACHINE, robot: RobotFacts = ROBOT) -> list[Diagnosis]:
     return [one for one in examine(machine, robot) if one.grade != "ok"]
+
+
+@pytest.mark.parametrize(("name", "grade"), [("decision", "bad"), ("page", "hint")])
+def test_processes_of_one_name_are_found(name: str, grade: str) -> None:
+    robot = replace(ROBOT, namesakes={name: ("pid 7 on waffle", "pid 8 on desk")})
+    (one,) = found(robot=robot)
+    assert (one.grade, one.about) == (grade, name)
+    assert one.text == "2 processes have this name: pid 7 on waffle, pid 8 on desk"
+
+
+@pytest.mark.parametrize(
+    ("pids", "both"),
+    [((1, 1, 1), False), ((1, 1, 2, 2), False), ((1, 2, 1), True), ((1, 2, 2, 1), True)],
+)
+async def test_only_processes_that_report_in_turn_share_a_name(
+    pids: tuple[int, ...], both: bool
+) -> None:
+    net = Net()
+    facts = asyncio.ensure_future(doctor._collect(net.two, "", 0.05))
+    await asyncio.sleep(0)
+    for pid in pids:
+        net.one.publish(HEALTH, health("decision", pid=pid, host="waffle"), name="decision")
+    places = {"decision": ("pid 1 on waffle", "pid 2 on waffle")} if both else {}
+    assert (await facts).namesakes == places
 
 
 def test_what_a_process_reports_is_found_with_its_cure() -> None:
