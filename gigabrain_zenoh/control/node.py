@@ -260,7 +260,7 @@ async def run(bus: Bus, ready: Callable[[], None]) -> None:
     bodies = bus.latest(BODY, arm.prepare)
     states = bus.latest(STATE, act)
     intents = bus.latest(INTENT, on_intent)
-    bus.latest(SAFETY, verdicts.receive, lazy=True)
+    bus.latest(SAFETY, verdicts.receive)
     bus.latest(TELEOP, teleop.receive)
     bus.latest(JOINT_TELEOP, arm.teleop.receive)
     bus.progress = Progress(

@@ -127,10 +127,9 @@ class ContextSource:
         if body and not self._subscribed_commands:
             self._subscribed_commands = True
             if body.description.has_base:
-                topic = command_topic(body.description)
-                self._bus.subscribe(topic, self._on_command, lazy=True)
+                self._bus.subscribe(command_topic(body.description), self._on_command)
             if body.description.joints:
-                self._bus.subscribe(JOINT_CMD, self._on_joint_command, lazy=True)
+                self._bus.subscribe(JOINT_CMD, self._on_joint_command)
 
     def at_scan(
         self, state: RobotState, world: WorldModel | None, verdict: SafetyState | None

@@ -204,5 +204,5 @@ def _serve(config: DecisionConfig, bus: Bus, source: InputSource) -> None:
     contours = ContourFilter(bus.counters)
     states = bus.latest(STATE, decide)
     worlds = bus.latest(WORLD, on_world)
-    bus.latest(SAFETY, verdicts.receive, lazy=True)
+    bus.latest(SAFETY, verdicts.receive)
     bus.progress = Progress(received, lambda: () if source.hung else (loop.basis, late_worlds))
