@@ -30,7 +30,6 @@ from gigabrain_zenoh.errors import BodyLost, ConfigError, Refused
 if TYPE_CHECKING:
     from gigabrain_drivers.sim.physics import Simulation
 
-
 T = TypeVar("T")
 STEPS_PER_TICK = TICK_NS // STEP_NS  # physics steps per tick of the robot's clock
 COMMAND_TIMEOUT_NS = 150_000_000  # simulated time after which the body stops, like a firmware
